@@ -198,6 +198,38 @@ def test_without_time_between_greens_some_is_put_in(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("phases", "seconds"),
+    [
+        ([(30, [0]), (3, []), (2, []), (30, [1, 2]), (3, []), (2, [])], [30, 3, 2, 30, 3, 2]),
+        ([(30, [0]), (4, []), (30, [1, 2]), (6, [])], [30, 3, 1, 30, 3, 3]),
+        ([(2, []), (30, [0]), (30, [1, 2]), (2, [])], [30, 3, 1, 30, 3, 1]),
+        ([(8, [0]), (4, []), (8, [1, 2]), (4, [])], [8, 3, 1, 8, 3, 1]),
+    ],
+)
+def test_time_between_two_greens_is_that_of_the_phases_between_them(
+    phases: list[tuple[float, list[int]]], seconds: list[float], tmp_path: Path
+) -> None:
+    net = crossroads()
+    light = net["intersections"][0]["trafficLight"]
+    light["lightphases"] = [{"time": s, "availableRoadLinks": links} for s, links in phases]
+    assert main(["scenario", "new", str(tmp_path / "city"), *write(tmp_path, net)]) == 0
+    (item,) = Network.read(read_scenario(tmp_path / "city")).intersections
+    assert [length for length, _ in item.programme] == seconds
+
+
+def test_links_with_green_on_both_sides_may_go_between_two_greens(tmp_path: Path) -> None:
+    """The turn from the south has no green with the third phase, and so not always."""
+    net = crossroads()
+    light = net["intersections"][0]["trafficLight"]
+    phases = [(30, [0, 2]), (5, [2]), (30, [1, 2]), (5, []), (30, [0]), (5, [])]
+    light["lightphases"] = [{"time": s, "availableRoadLinks": links} for s, links in phases]
+    assert main(["scenario", "new", str(tmp_path / "city"), *write(tmp_path, net)]) == 0
+    (item,) = Network.read(read_scenario(tmp_path / "city")).intersections
+    assert [seconds for seconds, _ in item.programme] == [30, 3, 2, 30, 3, 2, 30]
+    assert [item.programme[place][1][2:] for place in (2, 5)] == ["rs", "rr"]
+
+
+@pytest.mark.parametrize(
     ("greens", "said"),
     [
         ([[0], [1, 2], [0], [1]], "the greens 0 and 2 of the file, from 0, are equal at 1 light"),

@@ -13,8 +13,10 @@ import json
 import math
 import tempfile
 import xml.etree.ElementTree as ET
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -265,25 +267,25 @@ def _set_programmes(root: ET.Element, net: Roadnet) -> list[str]:
         width = len(number_of)
         for phase in list(logic):
             logic.remove(phase)
-        greens, clearance_s, always = _split(crossing)
-        if not clearance_s:
+        greens = _split(crossing)
+        if not any(green.clearance_s for green in greens):
             without.append(crossing.id)
         states = [
             state_of(
-                [k for k in crossing_links if number_of[k.index] in green],
+                [k for k in crossing_links if number_of[k.index] in green.links],
                 crossing_links,
                 rules,
                 width,
             )
-            for _, green in greens
+            for green in greens
         ]
         if numbers := _equal_greens(states):
             equal[numbers].append(crossing.id)
-        for place, (seconds, _) in enumerate(greens):
+        for place, green in enumerate(greens):
             following = states[(place + 1) % len(states)]
-            ET.SubElement(logic, "phase", duration=f"{seconds:g}", state=states[place])
+            ET.SubElement(logic, "phase", duration=f"{green.seconds:g}", state=states[place])
             for duration, state in _clearing(
-                states[place], following, clearance_s, _letters(number_of, always)
+                states[place], following, green.clearance_s, _letters(number_of, green.going)
             ):
                 ET.SubElement(logic, "phase", duration=f"{duration:g}", state=state)
     notes = [
@@ -307,13 +309,29 @@ def _equal_greens(states: Sequence[str]) -> str:
     return ", ".join(" and ".join(numbers) for numbers in places.values() if len(numbers) > 1)
 
 
-def _split(
-    crossing: Crossing,
-) -> tuple[list[tuple[float, frozenset[int]]], float, frozenset[int]]:
-    """Return the green phases, the seconds between two of them, and the links always green.
+@dataclass(frozen=True, slots=True)
+class _Green:
+    """Green phase of a light, with the time between it and the next one.
 
-    CityFlow's files have a separate phase for the time between two greens, usually the first phase.
-    In it only links that are always green may go.
+    Attributes:
+        seconds: Its length, s.
+        links: Road links with green.
+        clearance_s: Time until the next green, s; 0 if the light has no phase between two greens.
+        going: Road links that may go in this time.
+    """
+
+    seconds: float
+    links: frozenset[int]
+    clearance_s: float
+    going: frozenset[int]
+
+
+def _split(crossing: Crossing) -> list[_Green]:
+    """Return the green phases of a light.
+
+    CityFlow's files have separate phases for the time between two greens. In these, only links may
+    go that have green before and after. Many files have such a phase once, usually as the first
+    one, and mean it between all greens.
     """
     phases = [(seconds, frozenset(links)) for seconds, links in crossing.phases if seconds > 0]
     if not phases:
@@ -321,15 +339,36 @@ def _split(
             f"intersection {crossing.id!r}: no light phase has a time above 0; give each its "
             "seconds"
         )
-    greens = [
-        phase
-        for phase in phases
-        if phase[0] > LONGEST_CLEARANCE_S or not all(phase[1] <= other for _, other in phases)
-    ]
-    greens = greens or phases
-    between = [phase for phase in phases if phase not in greens]
-    always = frozenset.intersection(*(links for _, links in greens))
-    return greens, between[0][0] if between else 0.0, always
+    places = _green_places(phases)
+    runs: list[list[tuple[float, frozenset[int]]]] = []  # a green and what follows it
+    for place in (*range(places[0], len(phases)), *range(places[0])):
+        if place in places:
+            runs.append([])
+        runs[-1].append(phases[place])
+    always = frozenset.intersection(*(phases[place][1] for place in places))
+    usual_s = next((sum(s for s, _ in gap) for _, *gap in runs if gap), 0.0)
+    greens: list[_Green] = []
+    for (seconds, links), *gap in runs:
+        clearance_s = sum(s for s, _ in gap) or usual_s
+        going = frozenset[int].intersection(*(own for _, own in gap)) if gap else always
+        greens.append(_Green(seconds, links, clearance_s, always | going))
+    return greens
+
+
+def _green_places(phases: Sequence[tuple[float, frozenset[int]]]) -> list[int]:
+    """Return the positions of the green phases, in their order.
+
+    A phase is none if it is short and its links have green in the greens before and after it.
+    """
+    greens = [place for place, (seconds, _) in enumerate(phases) if seconds > LONGEST_CLEARANCE_S]
+    short = [place for place in range(len(phases)) if place not in greens]
+    short.sort(key=lambda place: -len(phases[place][1]))  # greens have more links than others
+    for place in short:
+        at = bisect_left(greens, place)
+        around = (greens[at - 1], greens[at % len(greens)]) if greens else ()
+        if not around or not all(phases[place][1] <= phases[green][1] for green in around):
+            greens.insert(at, place)
+    return greens
 
 
 def _letters(number_of: dict[int, int], numbers: frozenset[int]) -> set[int]:
