@@ -216,9 +216,28 @@ def test_a_scenario_is_not_written_over_the_files_it_is_read_from(
     (tmp_path / "link").symlink_to(directory)
     changed = apply_effects(read_scenario(directory), [DemandLevel("*", 0.5), LateGreen("*", 2.0)])
     for place in (directory, tmp_path / "link"):
-        with pytest.raises(OutputError, match="it there would change them; give another dir"):
+        with pytest.raises(OutputError, match="it there would change it; give another dir"):
             changed.write(place)
     assert {file.name: file.read_bytes() for file in directory.iterdir()} == before
+
+
+def test_a_scenario_is_not_written_over_files_it_links_to(
+    crossing: Crossing, tmp_path: Path
+) -> None:
+    directory, data = crossing(), tmp_path / "data"
+    data.mkdir()
+    for name in ("network.net.xml", "demand.rou.xml"):
+        (directory / name).rename(data / name)
+    toml = directory / "scenario.toml"
+    text = toml.read_text()
+    for name in ("network.net.xml", "demand.rou.xml"):
+        text = text.replace(f'"{name}"', f'"{data / name}"')
+    toml.write_text(text)
+    before = {file.name: file.read_bytes() for file in data.iterdir()}
+    changed = apply_effects(read_scenario(directory), [DemandLevel("*", 0.5), LateGreen("*", 2.0)])
+    with pytest.raises(OutputError, match=r"network\.net\.xml: scenario .* read from this file"):
+        changed.write(data)
+    assert {file.name: file.read_bytes() for file in data.iterdir()} == before
 
 
 @given(

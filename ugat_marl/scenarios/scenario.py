@@ -48,8 +48,8 @@ class Scenario:
         settings: All settings of ``scenario.toml``.
         applied: Descriptions of the effects that made this scenario out of another one.
         outputs: Folders into which measurements of the suite let SUMO write. No file can name one.
-        folder: Folder that it, or the scenario it was made of, was read from; None if it was made
-            in memory.
+        sources: Files that it, or the scenario it was made of, was read from, without symbolic
+            links; empty if it was made in memory.
     """
 
     id: str
@@ -59,7 +59,7 @@ class Scenario:
     settings: ScenarioFile
     applied: tuple[str, ...] = field(default=())
     outputs: tuple[str, ...] = field(default=(), compare=False)
-    folder: Path | None = field(default=None, compare=False)
+    sources: frozenset[Path] = field(default=frozenset(), compare=False)
 
     @property
     def control(self) -> ControlSettings:
@@ -122,15 +122,16 @@ class Scenario:
             `directory`.
 
         Raises:
-            OutputError: This scenario was read from `directory`.
+            OutputError: This scenario was read from one of the files that it would write.
             ScenarioError: Two of its files have one name.
         """
-        if self.folder is not None and self.folder.resolve() == directory.resolve():
-            raise OutputError(
-                f"{directory}: holds the files that scenario {self.id!r} was read from, and "
-                "writing it there would change them; give another directory"
-            )
         names = [document.name for document in self.documents]
+        for name in (*names, "scenario.toml"):
+            if (directory / name).resolve() in self.sources:
+                raise OutputError(
+                    f"{directory / name}: scenario {self.id!r} was read from this file, and "
+                    "writing it there would change it; give another directory"
+                )
         if twice := [name for name in names if names.count(name) > 1]:
             raise ScenarioError(
                 f"scenario {self.id!r}: two of its files are called {twice[0]!r}, which one "
@@ -232,15 +233,21 @@ def _load_directory(directory: Path) -> Scenario:
             raise ScenarioError(f"{file}: {key} names {name!r}, but {path} does not exist")
         return admitted(Document(path.name, path.absolute()))  # users may change their folder
 
-    return Scenario(
+    scenario = Scenario(
         id=directory.resolve().name,
         network=document(settings.network, "network"),
         routes=tuple(document(name, "routes") for name in settings.routes),
         additional=tuple(document(name, "additional") for name in settings.additional),
         settings=settings,
         applied=tuple(line.removeprefix(_MADE_BY) for line in first),
-        folder=directory.absolute(),
     )
+    return _with_sources(scenario, file)
+
+
+def _with_sources(scenario: Scenario, file: Path) -> Scenario:
+    """Return a scenario that was read from `file` and the documents it names."""
+    paths = (file, *(document.path for document in scenario.documents))
+    return replace(scenario, sources=frozenset(path.resolve() for path in paths if path))
 
 
 _MADE_BY = "# made by applying "
@@ -391,8 +398,7 @@ def _load_sumocfg(path: Path, scenario_id: str) -> Scenario:
         },
         str(path),
     )
-    folder = path.parent.absolute()
-    return Scenario(scenario_id, network, routes, additional, settings, folder=folder)
+    return _with_sources(Scenario(scenario_id, network, routes, additional, settings), path)
 
 
 def _is_file(path: Path) -> bool:
