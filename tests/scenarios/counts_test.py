@@ -120,6 +120,26 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
     assert read_scenario(tmp_path / "again").hash == read_scenario(tmp_path / "city").hash
 
 
+def test_what_is_ambiguous_in_origins_and_destinations_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    reporter = Silent()
+    monkeypatch.setattr(reporter, "say", said.append)
+    quarters = ["0,900", "900,1800", "0,1800"]
+    rows = "".join(f"west1_A1,B1_east1,1.250,{times}\n" for times in quarters)
+    (tmp_path / "t.csv").write_text(f"from,to,count,begin_s,end_s\n{rows}")
+    assert len(read_rows(tmp_path / "t.csv", 0, 3600, reporter, pairs=True)) == 3
+    (tmp_path / "t.csv").write_text("from,to,count\na,b,1.25\na,c,5\na,c,2\na,c,3\nb,c,4\n")
+    read_rows(tmp_path / "t.csv", 0, 3600, reporter, pairs=True)
+    overlap = "note: t.csv: rows that overlap an earlier one of the same origin and destination"
+    assert said == [
+        "note: t.csv: counts such as 1.250 were read as 1.25 vehicles",
+        f"{overlap}, and add up: 2 (the first: line 4, with line 2)",
+        f"{overlap}, and add up: 2 (the first: line 4, with line 3)",
+    ]
+
+
 @pytest.mark.parametrize(
     ("option", "text", "says"),
     [
@@ -128,6 +148,12 @@ def test_origins_and_destinations(tmp_path: Path) -> None:
         ("--counts", "edge,count\nwest1_A1,6e6\n", "line 2: more than 5000000 vehicles; keep"),
         ("--od", "from,to,count\nwest1_A1,B1_east1,1e18\n", "line 2: more than 5000000 veh"),
         ("--od", "edge,count\na,1\n", "t.csv, line 1: the columns from, to and count are needed"),
+        (
+            "--od",
+            "from,to,count,begin,until\nwest1_A1,B1_east1,5,00:00,00:15\n"
+            "west1_A1,B1_east1,5,00:15,00:30\n",
+            "line 3: west1_A1 -> B1_east1 is counted in line 2 as well, and there is no column end",
+        ),
         ("--counts", "sep=;\nedge;count\nwest1_A1;5\n", "line 1: 'sep=' is for a spreadsheet; del"),
         ("--counts", "edge,count\nwest1_A1,many\n", "line 2: count = 'many' is not a number"),
         (

@@ -81,6 +81,7 @@ class Row:
 _DAY_S = 86_400.0
 _TIMES = {"begin": "begin_s", "end": "end_s"}
 """Columns of times of day, and those of seconds in whose place they stand."""
+_INTERVAL = {*_TIMES, *_TIMES.values()}
 _READ = ("edge", "from", "to", "count")
 _LIKE_TIMES = re.compile(
     r"(begin|start|end|stop)[ _]?(s|sec|seconds|time|at)?|time([ _].*)?|interval|"
@@ -114,22 +115,8 @@ def read_rows(
     reader = csv.DictReader(chain((first,), texts), delimiter=delimiter_of(first))
     columns = columns_of(reader, path)
     turns = {"from", "to"} <= set(columns)
-    known = {*_TIMES, *_TIMES.values()}
-    if times := [name for name in columns if name not in known and _LIKE_TIMES.fullmatch(name)]:
-        raise ScenarioError(
-            f"{path}, line 1: column {times[0]!r} is not known; the interval of a row is begin_s "
-            "to end_s, in seconds, or begin to end, in times of day"
-        )
-    for name, seconds in _TIMES.items():
-        if {name, seconds} <= set(columns):
-            raise ScenarioError(f"{path}, line 1: has {name} and {seconds}; keep one of them")
-    if "count" not in columns or not (turns or ("edge" in columns and not pairs)):
-        wanted = "from, to and count" if pairs else "count and edge, or count, from and to"
-        raise ScenarioError(
-            f"{path}, line 1: the columns {wanted} are needed in the first line; there "
-            f"are: {', '.join(columns)}"
-        )
-    if others := [name for name in columns if name not in {*known, *_READ, *NAMES}]:
+    _check_columns(columns, path, pairs=pairs)
+    if others := [name for name in columns if name not in {*_INTERVAL, *_READ, *NAMES}]:
         reporter.say(f"note: {path.name}: {listed(others, 'column')} not read")
     rows_read: list[Row] = []
     written: dict[int, str] = {}
@@ -155,10 +142,39 @@ def read_rows(
         raise ScenarioError(f"{path}: no row counts a vehicle; fill in the column count")
     if not pairs:
         _refuse_thousands(written, path)
-        timeless = [name for name, seconds in _TIMES.items() if not {name, seconds} & {*columns}]
+    timeless = [name for name, seconds in _TIMES.items() if not {name, seconds} & {*columns}]
+    if pairs and len(timeless) != 1:
+        for note in _notes_of_pairs(rows_read, written):
+            reporter.say(f"note: {path.name}: {note}")
+    else:
         _refuse_overlaps(rows_read, path, timeless, others)
     _refuse_all_outside(rows_read, path, begin_s, end_s)
     return rows_read
+
+
+def _check_columns(columns: Sequence[str], path: Path, *, pairs: bool) -> None:
+    """Refuse a table without a needed column, or with an interval that cannot be read.
+
+    Args:
+        columns: Names in the first line.
+        path: The table.
+        pairs: True to require the columns ``from`` and ``to``.
+    """
+    turns = {"from", "to"} <= set(columns)
+    if times := [name for name in columns if name not in _INTERVAL and _LIKE_TIMES.fullmatch(name)]:
+        raise ScenarioError(
+            f"{path}, line 1: column {times[0]!r} is not known; the interval of a row is begin_s "
+            "to end_s, in seconds, or begin to end, in times of day"
+        )
+    for name, seconds in _TIMES.items():
+        if {name, seconds} <= set(columns):
+            raise ScenarioError(f"{path}, line 1: has {name} and {seconds}; keep one of them")
+    if "count" not in columns or not (turns or ("edge" in columns and not pairs)):
+        wanted = "from, to and count" if pairs else "count and edge, or count, from and to"
+        raise ScenarioError(
+            f"{path}, line 1: the columns {wanted} are needed in the first line; there "
+            f"are: {', '.join(columns)}"
+        )
 
 
 def _row(
@@ -200,6 +216,11 @@ _GROUPED = re.compile(r"[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
 """A number such as 1.250: a thousand and more, or a little more than one?"""
 
 
+def _are_grouped(written: Mapping[int, str]) -> bool:
+    """Return True if all counts that are no whole numbers may have a separator of thousands."""
+    return bool(written) and all(map(_GROUPED.fullmatch, written.values()))
+
+
 def _refuse_thousands(written: Mapping[int, str], path: Path) -> None:
     """Refuse counts with a separator of thousands, which reads as a decimal point.
 
@@ -207,7 +228,7 @@ def _refuse_thousands(written: Mapping[int, str], path: Path) -> None:
         written: Line to count, of those that are no whole numbers.
         path: The table.
     """
-    if written and all(_GROUPED.fullmatch(text) for text in written.values()):
+    if _are_grouped(written):
         line, text = next(iter(written.items()))
         raise ScenarioError(
             f"{path}, line {line}: count = {text!r} can be {re.sub('[.,]', '', text)} or a little "
@@ -393,24 +414,54 @@ def _refuse_overlaps(
         missing: Times of an interval, "begin" or "end", without a column.
         unread: Columns that are not read; one of them may hold a missing time.
     """
+    if not (found := next(_overlaps(rows), None)):
+        return
+    before, row = found
+    where, roads = f"{path}, line {row.line}", " -> ".join(row.roads)
+    if missing:
+        guess = f" (is it {first_names([*map(repr, unread)])}?)" if unread else ""
+        raise ScenarioError(
+            f"{where}: {roads} is counted in line {before.line} as well, and there is no "
+            f"column {missing[0]}{guess}; name the interval's columns begin and end for "
+            "times of day, or begin_s and end_s for seconds"
+        )
+    raise ScenarioError(
+        f"{where}: {row.begin} is before the end of an earlier interval of {roads}, "
+        f"{before.end} (line {before.line}); write intervals that do not overlap, and no "
+        "totals of several of them"
+    )
+
+
+def _overlaps(rows: Iterable[Row]) -> Iterator[tuple[Row, Row]]:
+    """Yield rows that begin before an earlier one of their roads has ended, each behind that one.
+
+    Of several earlier ones it is that which ends last.
+    """
     latest: dict[tuple[str, ...], Row] = {}
     for row in sorted(rows, key=lambda row: (row.begin_s, row.line)):
         before = latest.get(row.roads)
         if before and row.begin_s < before.end_s - 1e-3:  # files hold milliseconds
-            where, roads = f"{path}, line {row.line}", " -> ".join(row.roads)
-            if missing:
-                guess = f" (is it {first_names([*map(repr, unread)])}?)" if unread else ""
-                raise ScenarioError(
-                    f"{where}: {roads} is counted in line {before.line} as well, and there is no "
-                    f"column {missing[0]}{guess}; name the interval's columns begin and end for "
-                    "times of day, or begin_s and end_s for seconds"
-                )
-            raise ScenarioError(
-                f"{where}: {row.begin} is before the end of an earlier interval of {roads}, "
-                f"{before.end} (line {before.line}); write intervals that do not overlap, and no "
-                "totals of several of them"
-            )
-        latest[row.roads] = row
+            yield before, row
+        if before is None or row.end_s > before.end_s:
+            latest[row.roads] = row
+
+
+def _notes_of_pairs(rows: Iterable[Row], written: Mapping[int, str]) -> Iterator[str]:
+    """Yield notes on what is ambiguous in a table of origins and destinations, and may be meant.
+
+    Args:
+        rows: Rows of the table.
+        written: Line to count, of those that are no whole numbers.
+    """
+    if _are_grouped(written):
+        text = next(iter(written.values()))
+        yield f"counts such as {text} were read as {parse_decimal(text):g} vehicles"
+    if overlapping := list(_overlaps(rows)):
+        before, row = overlapping[0]
+        yield (
+            "rows that overlap an earlier one of the same origin and destination, and add up: "
+            f"{len(overlapping)} (the first: line {row.line}, with line {before.line})"
+        )
 
 
 def _turning_back(rows: Iterable[Row], drives: Sequence[Drive], streets: Streets) -> list[Drive]:
