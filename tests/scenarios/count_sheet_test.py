@@ -112,9 +112,20 @@ def test_counts_come_back_with_their_geh(draft: Path, capsys: pytest.CaptureFixt
         wanted = math.sqrt(2 * (m - c) ** 2 / (m + c)) if m + c else 0.0
         assert float(fit["geh"]) == pytest.approx(wanted, abs=0.005)
     assert (draft / "counts.csv").read_bytes() == filled
-    assert len([*(draft / "pictures").iterdir()]) > 0, "the drawings of the same roads are kept"
+    assert len([*(draft / "pictures").iterdir()]) > 0, "the lights are drawn again"
     assert made(draft, "--counts", draft / "counts.csv", "--force") == 0
     assert (draft / "pictures").is_dir(), "also where vehicles are made once more"
+
+
+def test_drawings_show_the_phases_of_the_scenario(draft: Path, tmp_path: Path) -> None:
+    before = (draft / "pictures" / "9.png").read_bytes()
+    fill_in(draft / "counts.csv", right="0")
+    words = ["--counts", draft / "counts.csv", "--duration-s", "600", "--phases", "conflict-free"]
+    assert made(draft, *words) == 0
+    assert main(["scenario", "draw", str(draft), "--out", str(tmp_path / "afresh")]) == 0
+    for drawing in (tmp_path / "afresh").glob("*.png"):
+        assert (draft / "pictures" / drawing.name).read_bytes() == drawing.read_bytes()
+    assert (draft / "pictures" / "9.png").read_bytes() != before
 
 
 def test_counts_that_cannot_all_be_met_come_first(

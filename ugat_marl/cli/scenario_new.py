@@ -146,6 +146,7 @@ class ScenarioNew:
         roads, vehicles = self._sources()
         if vehicles is None and not self._brings_vehicles():
             return self._draft(roads, console)
+        reporter = Bars(console)
         made = make_scenario(
             self.name,
             roads,
@@ -153,7 +154,8 @@ class ScenarioNew:
             settings=self._settings(),
             command=self._command(),
             force=self.force,
-            reporter=Bars(console),
+            reporter=reporter,
+            draw=lambda scenario, out: draw_network(scenario, out, reporter),
         )
         agents = len(made.network.intersections)
         phases = sum(len(light.phases) for light in made.network.intersections)

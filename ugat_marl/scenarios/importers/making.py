@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import filecmp
 import os
 import re
 import shlex
@@ -100,6 +99,9 @@ class VehicleFiles:
 VehicleSource = Callable[[Path, Path, Reporter], VehicleFiles]
 """Function that puts route files into a folder (first path) for a network (second path)."""
 
+Draw = Callable[[Scenario, Path], object]
+"""Function that draws the lights of a scenario, which may have no vehicles, into a folder."""
+
 
 @dataclass(frozen=True)
 class Made:
@@ -146,6 +148,7 @@ def make_scenario(
     command: str,
     force: bool,
     reporter: Reporter,
+    draw: Draw | None = None,
 ) -> Made:
     """Make a scenario directory atomically.
 
@@ -157,6 +160,8 @@ def make_scenario(
         command: Command that makes the scenario again, for the README.
         force: True to replace an existing scenario.
         reporter: Shows progress.
+        draw: Draws the lights anew if the folder that is replaced has drawings of them. None to
+            leave drawings out.
 
     Raises:
         OutputError: The directory exists, or cannot be written.
@@ -181,6 +186,8 @@ def make_scenario(
             demand = check_demand(scenario, network, reporter)
         made = Made(scenario, network, demand, notes, fleet.fits)
         write_whole(folder / "README.md", _readme(made, draft, command))
+        if draw and (target / PICTURES).is_dir():
+            draw(scenario, folder / PICTURES)
     return Made(read_scenario(target), network, demand, made.notes, made.fits)
 
 
@@ -191,7 +198,7 @@ def make_draft(
     settings: Mapping[str, Any],
     command: str,
     force: bool,
-    draw: Callable[[Scenario, Path], object],
+    draw: Draw,
     reporter: Reporter,
 ) -> Draft:
     """Make a folder with roads, drawn lights and a sheet of turning counts atomically.
@@ -204,7 +211,7 @@ def make_draft(
         settings: Values for ``scenario.toml``; they override those of the source.
         command: Command that makes the folder again, for the README.
         force: True to replace an existing scenario.
-        draw: Function that draws the lights of a scenario, which has no vehicles, into a folder.
+        draw: Draws the lights.
         reporter: Shows progress.
 
     Raises:
@@ -362,7 +369,6 @@ def new_folder(target: Path, *, force: bool) -> Iterator[Path]:
             yield made
             require_free(target, force=force)  # it may have appeared meanwhile
             _require_counts_kept(made, target)
-            _keep_pictures(made, target)
             put_folder(made, target, folder / "before")
     except ScenarioError as error:
         # Files are checked in the temporary folder, but errors should name the final one.
@@ -420,16 +426,6 @@ def _require_counts_kept(made: Path, target: Path) -> None:
             f"{old} would be lost; move it away first, write to another folder, or give it with "
             "--counts where a scenario is made from roads"
         )
-
-
-def _keep_pictures(made: Path, target: Path) -> None:
-    """Keep the drawings of a folder if its network stays the same."""
-    pictures = target / PICTURES
-    if not pictures.is_dir() or (made / PICTURES).exists():
-        return
-    networks = [_named_files(folder)[0] for folder in (target, made)]
-    if all(map(Path.is_file, networks)) and filecmp.cmp(*networks, shallow=False):
-        shutil.copytree(pictures, made / PICTURES)
 
 
 def _named_files(folder: Path) -> tuple[Path, ...]:
