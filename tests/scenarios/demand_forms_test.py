@@ -70,6 +70,19 @@ def test_of_districts_it_is_said_that_ways_differ() -> None:
     assert note.startswith("'z' runs between districts")
 
 
+@pytest.mark.parametrize(
+    ("rate", "by_chance"),
+    [('probability="0.1"', True), ('period="exp(0.1)"', True), ('vehsPerHour="360"', False)],
+)
+def test_of_random_flows_it_is_said_that_days_vary_one_draw(rate: str, by_chance: bool) -> None:
+    scenario = with_routes(
+        f'<flow id="f" begin="0" end="600" {rate} from="west1_A1" to="A1_east1"/>'
+    )
+    notes = [note.partition(":")[0] for note in survey(scenario).notes]
+    assert notes == ["'f' departs at random"] * by_chance
+    assert len({demand_as_vehicles(scenario).hash for _ in range(2)}) == 1
+
+
 def test_a_day_with_many_vehicles_has_them_all() -> None:
     """On this day the demand is seven times the usual one, so some vehicles have nine copies."""
     route = '<route edges="west1_A1 A1_east1"/>'

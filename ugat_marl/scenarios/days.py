@@ -98,7 +98,9 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
     scenario's begin are left out, as SUMO leaves them out. A shift across the start or the end of
     the scenario is mirrored there, so the mean number of vehicles within it is that of the demand.
     Persons, and vehicles that block a lane, wait for a person or are named by one's ride, or have
-    a line that is, are the same every day. Times of stops move with the departure. A vehicle with a
+    a line that is, are the same every day. Flows with random departures are drawn once, by
+    `demand_as_vehicles`, and all days vary that draw: their mean is its number of vehicles, and not
+    the expectation of the flow. Times of stops move with the departure. A vehicle with a
     speedFactor of its own keeps it; others draw it from that of their type.
 
     Args:

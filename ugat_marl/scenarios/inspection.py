@@ -24,7 +24,7 @@ from ugat_marl.scenarios.phases import (
     programme_phases,
     turn_of,
 )
-from ugat_marl.scenarios.routes import between_districts, departures
+from ugat_marl.scenarios.routes import between_districts, departures, random_flow
 from ugat_marl.scenarios.scenario import Scenario
 from ugat_marl.scenarios.signals import AMBER, GREEN, YELLOW
 from ugat_marl.scenarios.street_names import intersection_name
@@ -247,21 +247,25 @@ def survey(scenario: Scenario, reporter: Reporter | None = None) -> Survey:
         traffic.busiest_length_s,
         scenario.control.yellow_s,
         scenario.control.all_red_s,
-        (*network.notes, *_notes_of_demand(scenario)),
+        (*network.notes, *_notes_of_demand(scenario, demand)),
     )
 
 
-def _notes_of_demand(scenario: Scenario) -> tuple[str, ...]:
-    """Return what makes the demand of this survey differ from that of an episode."""
-    vehicle = between_districts(scenario)
-    if not vehicle:
-        return ()
-    return (
-        f"{vehicle!r} runs between districts (fromTaz, toTaz): in an episode SUMO chooses where "
-        "it begins and ends by the travel times of the moment, while this check, drawn days and a "
-        "diagnosis take the quickest free-flow route; those that duarouter writes are the same in "
-        "all",
-    )
+def _notes_of_demand(scenario: Scenario, demand: Demand) -> Iterator[str]:
+    """Yield what makes the demand of this survey differ from that of an episode."""
+    if demand.flows and (flow := random_flow(scenario)):
+        yield (
+            f"{flow!r} departs at random: SUMO draws its vehicles for each episode, while this "
+            "check, drawn days and a diagnosis take one draw, whose number of vehicles may be off "
+            "the expected one by chance; give it vehsPerHour, or single vehicles"
+        )
+    if vehicle := between_districts(scenario):
+        yield (
+            f"{vehicle!r} runs between districts (fromTaz, toTaz): in an episode SUMO chooses "
+            "where it begins and ends by the travel times of the moment, while this check, drawn "
+            "days and a diagnosis take the quickest free-flow route; those that duarouter writes "
+            "are the same in all"
+        )
 
 
 PHASE_SOURCES = ("programme", "conflict-free", "permitted")

@@ -82,7 +82,8 @@ def demand_as_vehicles(scenario: Scenario) -> Scenario:
 
     Demand in additional files moves to the route files. Vehicle types, named routes, persons and
     containers stay what they are. SUMO's option ``scale`` is carried out and left out. Vehicles
-    between districts take the quickest free-flow route, see `between_districts`.
+    between districts take the quickest free-flow route, see `between_districts`. Random departures
+    are drawn once, with a fixed seed, see `random_flow`.
 
     Raises:
         ScenarioError: duarouter refuses; the message quotes it.
@@ -117,6 +118,20 @@ def between_districts(scenario: Scenario) -> str:
         for tag in document.scan():
             if tag.name in DEPARTING and {"fromTaz", "toTaz"} & tag.attributes.keys():
                 return tag.attributes.get("id", "")
+    return ""
+
+
+def random_flow(scenario: Scenario) -> str:
+    """Return the id of a flow with random departures; empty if there is none.
+
+    SUMO draws the departures of each episode. duarouter draws them once, and always the same.
+    """
+    for document in (*scenario.routes, *scenario.additional):
+        for tag in document.scan():
+            given = tag.attributes
+            by_chance = "probability" in given or given.get("period", "").strip().startswith("exp(")
+            if tag.name == "flow" and departs(tag) and by_chance:
+                return given.get("id", "")
     return ""
 
 
