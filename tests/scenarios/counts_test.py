@@ -14,6 +14,7 @@ from ugat_marl.__main__ import main
 from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import read_scenario, sumo_program
+from ugat_marl.scenarios.importers import counts
 from ugat_marl.scenarios.importers.counts import Row, _closed, _outside, read_rows
 
 
@@ -416,6 +417,20 @@ def test_counted_u_turns_are_driven(tmp_path: Path) -> None:
     turned = [edges for _, edges in drives(tmp_path / "city") if "A0bottom0" in edges]
     back = [edges for edges in turned if ("bottom0A0", "A0bottom0") in pairwise(edges)]
     assert len(back) == pytest.approx(20, abs=1)
+
+
+def test_turns_that_no_random_route_takes_are_driven(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At two vehicles an hour at each entry few turns are taken."""
+    monkeypatch.setattr(counts, "_CANDIDATES_VPH", 2.0)
+    turns = ["B2_B3,B3_C3", "C3_C2,C2_B2", "B2_A2,A2_A1"]
+    (tmp_path / "t.csv").write_text("\n".join(["from,to,count", *(f"{x},20" for x in turns), ""]))
+    words = ["--grid", "3x3", "--counts", str(tmp_path / "t.csv")]
+    assert main(["scenario", "new", str(tmp_path / "city"), *words]) == 0
+    passed = Counter(pair for _, edges in drives(tmp_path / "city") for pair in pairwise(edges))
+    for turn in turns:
+        assert passed[tuple(turn.split(","))] == pytest.approx(20, abs=2)
 
 
 def test_intervals_with_inclusive_ends_touch() -> None:

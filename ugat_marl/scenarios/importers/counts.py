@@ -10,7 +10,7 @@ import tempfile
 import xml.etree.ElementTree as ET
 from bisect import bisect_left
 from collections import defaultdict, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, pairwise
@@ -325,8 +325,8 @@ def _number(text: str | None, key: str, where: str) -> float:
 def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSource:
     """Return a source of vehicles that meet counts, with SUMO's routeSampler.
 
-    routeSampler chooses among random routes through the network. Every counted road must lie on one
-    of them.
+    routeSampler chooses among random routes through the network, and the shortest ones by counted
+    roads and turns on none of them.
 
     Args:
         path: CSV file with the counts.
@@ -344,7 +344,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
             work = Path(name)
             drives = walked(streets, _CANDIDATES_VPH, (1.0, 1.0, 1.0), 3600.0, seed)
-            drives += _turning_back(rows, drives, streets)
+            drives += list(_not_drawn(rows, drives, streets))
             _require_reached(rows, drives, path)
             write_drives(work / "candidates.rou.xml", drives)
             rows = _closed(rows)
@@ -464,25 +464,46 @@ def _notes_of_pairs(rows: Iterable[Row], written: Mapping[int, str]) -> Iterator
         )
 
 
-def _turning_back(rows: Iterable[Row], drives: Sequence[Drive], streets: Streets) -> list[Drive]:
-    """Return a way for each counted U-turn: none of `drives` turns back."""
-    made: list[Drive] = []
+def _not_drawn(rows: Iterable[Row], drives: Sequence[Drive], streets: Streets) -> Iterator[Drive]:
+    """Yield the shortest way by each counted road or turn by which none of `drives` comes.
+
+    Random drives never turn back, and in a large network miss some turns by chance.
+    """
+    onward: dict[str, list[str]] = defaultdict(list)
+    behind: dict[str, list[str]] = defaultdict(list)
+    for here, turns in streets.ahead.items():
+        for there in (road for turn, roads in turns.items() if turn != "t" for road in roads):
+            onward[here].append(there)
+            behind[there].append(here)
+    drawn = _passages(drives)
     for row in rows:
-        here, there = row.roads[0], row.roads[-1]
-        if not row.count or there not in streets.ahead.get(here, {}).get("t", ()):
-            continue
-        before = next((drive.route for drive in drives if here in drive.route), None)
-        after = next((drive.route for drive in drives if there in drive.route), None)
-        if before and after:
-            route = (*before[: before.index(here) + 1], *after[after.index(there) :])
-            made.append(Drive(f"back{row.line}", 0.0, route))
-    return made
+        if row.count and row.roads not in drawn:
+            before = _way(behind, row.roads[0], streets.entries)
+            after = _way(onward, row.roads[-1], streets.exits)
+            if before and after:
+                joined = after[1:] if len(row.roads) == 1 else after
+                yield Drive(f"by{row.line}", 0.0, (*before[::-1], *joined))
+
+
+def _way(
+    neighbours: Mapping[str, Sequence[str]], start: str, goals: Collection[str]
+) -> tuple[str, ...]:
+    """Return the fewest roads from one to any of `goals`, with both ends; empty without a way."""
+    way_to: dict[str, tuple[str, ...]] = {start: (start,)}
+    waiting = deque([start])
+    while waiting:
+        road = waiting.popleft()
+        if road in goals:
+            return way_to[road]
+        for following in neighbours.get(road, ()):
+            if following not in way_to:
+                way_to[following] = (*way_to[road], following)
+                waiting.append(following)
+    return ()
 
 
 def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -> None:
-    reached: set[tuple[str, ...]] = {(road,) for drive in drives for road in drive.route}
-    for drive in drives:
-        reached.update(zip(drive.route, drive.route[1:], strict=False))
+    reached = _passages(drives)
     for row in rows:
         if row.count and row.roads not in reached:
             raise ScenarioError(
