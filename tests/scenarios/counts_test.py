@@ -440,6 +440,9 @@ def test_intervals_with_inclusive_ends_touch() -> None:
     assert _closed(rows((0, 899), (900, 1799), (0, 899))) == rows((0, 900), (900, 1800), (0, 900))
     for spans in (((0, 900), (900, 1800)), ((0, 600), (900, 1800)), ((0, 3600),)):
         assert _closed(rows(*spans)) == rows(*spans)
+    assert _closed(rows((0, 840), (900, 1740))) == rows((0, 900), (900, 1800))
+    for spans in (((0, 840), (900, 1800)), ((0, 830), (890, 1720)), ((0, 840), (960, 1800))):
+        assert _closed(rows(*spans)) == rows(*spans), "not all are whole minutes of one length"
     # a count of the whole episode beside them keeps its end
     assert _closed(rows((0, 899), (900, 1799), (0, 1800))) == rows((0, 900), (900, 1800), (0, 1800))
 

@@ -513,9 +513,12 @@ def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -
 
 
 def _closed(rows: Sequence[Row]) -> list[Row]:
-    """Return rows whose intervals touch, where those of one length end a second early (0 to 899).
+    """Return rows whose inclusive ends are moved to the begin of the next interval.
 
-    routeSampler would be given intervals of one second, and would not end.
+    Inclusive ends are one second before that begin (0 to 899, 900 to 1799), or one minute (7:00 to
+    7:14, 7:15 to 7:29). A minute may also be a real gap. It is closed only if all times are whole
+    minutes and all intervals have one length. A gap of a second would be an interval of its own for
+    routeSampler, which would not end. A minute would stay empty.
     """
     begins = sorted({row.begin_s for row in rows})
     gaps = {
@@ -523,11 +526,14 @@ def _closed(rows: Sequence[Row]) -> list[Row]:
         for row in rows
         if (place := bisect_left(begins, row.end_s)) < len(begins)
     }
-    if gaps != {1.0}:
+    every = {row.end_s - row.begin_s for row in rows}
+    minutes = not any(row.begin_s % 60 or row.end_s % 60 for row in rows)
+    if gaps != {1.0} and not (gaps == {60.0} and minutes and len(every) == 1):
         return list(rows)
-    lengths = {row.end_s - row.begin_s for row in rows if row.end_s + 1.0 in begins}
+    (gap_s,) = gaps
+    lengths = {row.end_s - row.begin_s for row in rows if row.end_s + gap_s in begins}
     return [
-        replace(row, end_s=row.end_s + 1.0) if row.end_s - row.begin_s in lengths else row
+        replace(row, end_s=row.end_s + gap_s) if row.end_s - row.begin_s in lengths else row
         for row in rows
     ]
 
