@@ -296,6 +296,13 @@ def test_a_configuration_keeps_its_end_under_another_begin(
     assert (settings.begin_s, settings.duration_s) == episode
 
 
+def test_roads_of_a_grid_may_be_fast(tmp_path: Path) -> None:
+    words = ["--grid", "1x2", "--vph", "100", "--speed-mps", "60"]
+    assert made(tmp_path / "a", *words) == 0
+    lanes = Network.read(read_scenario(tmp_path / "a")).lanes
+    assert {lane.speed_mps for lane in lanes.values()} == {60.0}
+
+
 def test_what_a_scenario_cannot_have_is_said(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -33,6 +33,8 @@ MAIN_ROAD = ("sr", "s", "l")
 NETCONVERT = {
     "tls.cycle.time": 90, "tls.left-green.time": 10, "tls.minor-left.max-speed": 0,
     "tls.yellow.time": 3, "tls.allred.time": 2,
+    # turns are driven as slowly as their radius asks; netconvert warns of it on fast roads
+    "junctions.limit-turn-speed.warn.straight": 100, "junctions.limit-turn-speed.warn.turn": 100,
 }  # fmt: skip
 MOST = 2500
 """Most intersections in a grid."""
