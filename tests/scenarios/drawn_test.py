@@ -209,11 +209,20 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     [
         {"intersections": (0, 3)}, {"intersections": (7, 8)}, {"lanes": (3, 2)},
         {"load": (0.5, 9.0)}, {"shift": 0.3}, {"profiles": ()}, {"turns": (0.0, 1.0, 0.0)},
+        {"profiles": ("foo",)}, {"turns": (0.5, 0.5)}, {"turns": (float("nan"), 0.5, 0.5)},
+        {"turns": (0.5, float("nan"), 0.5)}, {"load": (0.5, 0.6, 0.7)}, {"lanes": (1,)},
+        {"load": (0.5, float("nan"))},
     ],
 )  # fmt: skip
 def test_impossible_ranges(values: dict[str, object]) -> None:
     with pytest.raises(OptionError):
         draw_network(1, NetworkRanges(**values))  # pyright: ignore[reportArgumentType]
+
+
+def test_roads_may_be_as_fast_as_the_ranges_say(tmp_path: Path) -> None:
+    ranges = NetworkRanges(speed_mps=(60, 60), intersections=(2, 2), irregular=1.0)
+    lanes = Network.read(draw_scenario(tmp_path / "fast", 1, ranges)).lanes
+    assert {lane.speed_mps for lane in lanes.values()} == {60.0}
 
 
 def test_nothing_is_left_where_nobody_enters(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -132,15 +132,16 @@ class NetworkRanges:
         """
         for name, (least, most) in _LIMITS.items():
             value = getattr(self, name)
-            low, high = value if isinstance(value, tuple) else (value, value)
-            if not least <= low <= high <= most:
+            bounds = value if isinstance(value, tuple) else (value, value)
+            if len(bounds) != 2 or not least <= bounds[0] <= bounds[1] <= most:
                 raise OptionError(
                     f"{name} = {value}: give values from {least:g} to {most:g}, the least first"
                 )
-        if not self.profiles or min(self.turns) <= 0:
+        if len(self.turns) != 3 or not all(0 < share < math.inf for share in self.turns):
+            raise OptionError(f"turns = {self.turns}: give three shares above 0")
+        if not self.profiles or not {*self.profiles} <= {*get_args(Profile)}:
             raise OptionError(
-                f"profiles = {self.profiles}, turns = {self.turns}: give at least one profile, and "
-                "shares above 0"
+                f"profiles = {self.profiles}: give one or more of {', '.join(get_args(Profile))}"
             )
 
 
