@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,6 +83,15 @@ def test_vehicles_that_no_score_would_hold_are_refused(crossing: Crossing) -> No
     unseen = '<vType id="t"><param key="has.tripinfo.device" value="false"/></vType>' + car("a", 0)
     with pytest.raises(ScenarioError, match="scores .* need the device tripinfo of every vehicle"):
         load_scenario(crossing(vehicles=unseen))
+
+
+@pytest.mark.parametrize(("scale", "refused"), [("0", True), ("0.0001", True), ("0.001", False)])
+def test_a_scale_that_leaves_out_all_vehicles_is_refused(
+    scale: str, refused: bool, crossing: Crossing
+) -> None:
+    directory = crossing(toml=lambda text: f'{text}[sumo]\nscale = "{scale}"\n')
+    with pytest.raises(ScenarioError, match="leaves out all") if refused else nullcontext():
+        check(directory)
 
 
 @pytest.mark.parametrize("kind", ["vehicles", "flow"])

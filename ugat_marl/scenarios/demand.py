@@ -98,6 +98,12 @@ def check_demand(
                     break
         else:
             routed &= singles.ended()
+    scale = demand_scale(scenario)
+    if not scaled_number(1, scale):
+        raise ScenarioError(
+            f'scenario {scenario.id!r}: [sumo] scale = "{scenario.settings.sumo["scale"]}" leaves '
+            "out all vehicles; give 0.001 or more"
+        )
     if not vehicles and not flows:
         files = ", ".join(document.source for document in scenario.routes)
         effects = f" after {', '.join(scenario.applied)}" if scenario.applied else ""
@@ -105,7 +111,6 @@ def check_demand(
             f"{files}: no vehicle departs between {begin:g} s and {end:g} s{effects}; "
             "check begin_s and duration_s against the departure times"
         )
-    scale = demand_scale(scenario)
     return Demand(scaled_number(vehicles, scale), flows, routed and scale == 1)
 
 
