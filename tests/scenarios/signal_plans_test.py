@@ -345,6 +345,7 @@ def test_columns_may_have_capitals(tmp_path: Path) -> None:
         (HEAD + GOOD.replace(",30,3,2", ",many,3,2", 1), "line 2: split_s = 'many' is not a time"),
         (HEAD + GOOD.replace("60,0,1,1", "60,0,x,1", 1), "line 2: ring = 'x' is not a number"),
         (HEAD + GOOD.replace("NBT NBR SBT SBR NBL SBL", ""), "line 2: movements is blank"),
+        (HEAD + GOOD.replace("A1,60,0,1,1,E", ",60,0,1,1,E"), "line 3: light is blank; write it"),
         (HEAD + GOOD.replace("NBT NBR", "NBT NXR"), "it has no movement 'NXR'; it has EBL"),
         (HEAD + GOOD.replace("NBL SBL", ""), "no phase serves NBL SBL, and"),
         (HEAD + GOOD.replace("NBL SBL", "NBL SBL WBT"), "are green together and cross"),

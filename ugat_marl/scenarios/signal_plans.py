@@ -704,6 +704,8 @@ def read_plans(path: Path) -> tuple[SignalPlan, ...]:
         if not any((row[name] or "").strip() for name in columns):
             continue  # as a spreadsheet writes below its table
         light = (row["light"] or "").strip()
+        if not light:
+            raise ScenarioError(f"{where}: light is blank; write it in every row")
         frame = _seconds(row, "cycle_s", where), _seconds(row, "offset_s", where)
         if frames.setdefault(light, frame) != frame:
             raise ScenarioError(
