@@ -524,8 +524,9 @@ def _green_s(
 ) -> float:
     """Return the green that the queue of a lane uses per cycle of the programme, s.
 
-    Vehicles leave one behind the other, so that one without green holds up those behind it. Each
-    road ahead is drawn by its share of the traffic; which vehicle is first is a Markov chain.
+    Vehicles queue in one lane, so the first one blocks the rest while it has no green. The turn of
+    the first vehicle is modelled as a Markov chain: when it leaves, the turn of the next one is
+    drawn by the shares of the traffic.
 
     Args:
         intersection: The intersection with its programme.

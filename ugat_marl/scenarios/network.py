@@ -344,10 +344,10 @@ def _programme_of(
 
 
 def _unknown_conflicts(intersections: Sequence[Intersection]) -> list[str]:
-    """Return a note on the lights of which SUMO's file tells no conflicts; none if there are none.
+    """Return one note that names the lights without a conflict matrix; empty if all have one.
 
-    The rows of its matrices are named by internal lanes, and `netconvert --no-internal-links`
-    leaves those out.
+    The rows of SUMO's matrices are named by internal lanes. `netconvert --no-internal-links` leaves
+    these out.
     """
     names = [light.id for light in intersections if all(x.request < 0 for x in light.links)]
     if not names:

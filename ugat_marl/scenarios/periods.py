@@ -141,8 +141,9 @@ class Passages:
     def spans(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return start and end of each passage, ``(passages,)``, without NaN.
 
-        If a vehicle comes or leaves unseen, its other time is both. The last ones without an off
-        stay to the end of the period and are on for ever. One without any time is on throughout.
+        A missing start or end is replaced by the other one. But the passages without an end behind
+        the last one that has an end stay for ever: no vehicle was seen to leave after them. A
+        passage without any time lasts throughout.
         """
         begin = np.where(np.isnan(self.on_s), self.off_s, self.on_s)
         begin = np.where(np.isnan(begin), -np.inf, begin)

@@ -402,10 +402,11 @@ def _children(document: Document, tags: frozenset[str]) -> Iterator[list[str]]:
 
 
 def _from_begin(documents: Iterable[Document], begin_s: float) -> tuple[Document, ...]:
-    """Return files whose flows with a probability begin in the episode.
+    """Return the files with no flow with a probability that begins before the episode.
 
-    duarouter never ends with one that begins earlier. Its seconds are independent, so that those
-    before the episode decide nothing in it. Flows that end before it are left out.
+    duarouter hangs on such a flow, so its begin is moved to the episode's. That changes nothing in
+    the episode, since departures in each second are independent. A flow that also ends before the
+    episode is left out.
     """
 
     def delay(part: ET.Element) -> None:

@@ -618,8 +618,8 @@ def _with_lanes(
     """Return the plan, with lanes for the turns that each approach has.
 
     No approach has more lanes straight on than the road ahead, and no road has lanes that nobody
-    enters. So a road that gets narrower can narrow those that lead to it, and all are gone through
-    until none changes.
+    enters. So narrowing one road can force its feeders to narrow. All roads are narrowed again
+    until nothing changes.
     """
     roads: dict[str, Road] = {}
     line_of: dict[str, _Line] = {}
