@@ -12,6 +12,7 @@ import pytest
 
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import ScenarioError
+from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Document, Scenario, demand_as_vehicles, draw_day, read_scenario
 from ugat_marl.scenarios.speed_factors import SpeedFactors
 
@@ -41,6 +42,15 @@ def departures(scenario: Scenario) -> np.ndarray:
     return np.array([float(time) for time in re.findall(rb' depart="([\d.]+)"', text)])
 
 
+def with_vehicles(scenario: Scenario, kept: np.ndarray) -> Scenario:
+    """Return the scenario with those of its vehicles that are chosen."""
+    root = scenario.routes[0].parse()
+    for vehicle, keep in zip(root.findall("vehicle"), kept.tolist(), strict=True):
+        if not keep:
+            root.remove(vehicle)
+    return replace(scenario, routes=(Document("chosen.rou.xml", None, xml_bytes(root)),))
+
+
 def test_vehicles_that_depart_before_the_begin_are_in_no_day() -> None:
     whole = load_scenario("single-v1")
     settings = whole.settings.model_copy(update={"begin_s": 1800.0, "duration_s": 1800.0})
@@ -64,6 +74,19 @@ def test_vehicles_that_depart_after_the_end_come_into_no_day() -> None:
     assert abs(mean - expected) < 2 * (expected / len(days)) ** 0.5  # Poisson
     after = np.mean([np.count_nonzero(day >= 600) for day in days])
     assert after == pytest.approx(np.count_nonzero(depart >= 600), rel=0.02)
+
+
+def test_shifts_are_mirrored_at_the_begin_and_the_end() -> None:
+    whole = load_scenario("single-v1")
+    due = departures(whole)
+    settings = whole.settings.model_copy(update={"begin_s": 600.0, "duration_s": 120.0})
+    after_begin = with_vehicles(replace(whole, settings=settings), (due >= 600) & (due < 720))
+    before_end = with_vehicles(whole.with_duration(600), (due >= 480) & (due < 600))
+    for seed in range(40):
+        departs = departures(draw_day(after_begin, seed))
+        assert departs.min() >= 600
+        assert np.count_nonzero(departs == 600) <= 1
+        assert departures(draw_day(before_end, seed)).max() < 600
 
 
 PERSONS = """

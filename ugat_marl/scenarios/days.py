@@ -71,6 +71,25 @@ class _Vehicles:
     stopping: Mapping[int, ET.Element]
     speeds: NDArray[np.float64]
 
+    def row(self, index: int, suffix: str, depart_s: float, factor: float) -> str:
+        """Return a copy of a vehicle as an element of a route file.
+
+        Args:
+            index: The vehicle.
+            suffix: End of the name of the copy.
+            depart_s: Its departure, s.
+            factor: Its speedFactor; NaN to let SUMO draw it.
+
+        Raises:
+            ScenarioError: As for `tail`.
+        """
+        name = quoteattr(self.names[index] + suffix)
+        speed = "" if np.isnan(factor) else f' speedFactor="{factor:.4f}"'
+        return (
+            f'<vehicle id={name} depart="{depart_s:.2f}"{speed}{self.heads[index]}'
+            f"{self.tail(index, depart_s - self.depart_s[index])}</vehicle>"
+        )
+
     def tail(self, index: int, later_s: float) -> str:
         """Return the children of a vehicle that departs later than in the demand.
 
@@ -137,33 +156,14 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
         draws = np.vstack((draws, further.standard_normal((more, count))))
     again = numpy_generator(seed, "speeds again")
     rows: list[tuple[float, str]] = []
-    mean, deviation, least, greatest = vehicles.speeds.T
-    least = np.maximum(least, _LEAST_FACTOR)
     for copy in range(most):
-        departs = vehicles.depart_s + shifts[copy]
-        departs = np.where(departs < begin, 2 * begin - departs, departs)
-        crosses = (departs >= end) != (vehicles.depart_s >= end)
-        departs = np.where(crosses, 2 * end - departs, departs)
-        departs = np.maximum(departs, begin)
-        factors = mean + deviation * draws[copy]
-        for _ in range(_AGAIN):  # SUMO, too, draws again what lies beyond a limit
-            if not (beyond := (factors < least) | (factors > greatest)).any():
-                break
-            factors = np.where(beyond, mean + deviation * again.standard_normal(count), factors)
-        factors = np.clip(factors, least, greatest)
+        departs = _reflected(vehicles.depart_s, shifts[copy], begin, end)
+        factors = _speed_factors(vehicles.speeds, draws[copy], again)
         suffix = f"~{seed}.{copy}"  # new names: effects choose other vehicles every day
-        for index in np.flatnonzero(copies > copy).tolist():
-            name = quoteattr(vehicles.names[index] + suffix)
-            factor = factors[index]
-            speed = f' speedFactor="{factor:.4f}"' if factor == factor else ""
-            depart = departs[index]
-            rows.append(
-                (
-                    depart,
-                    f'<vehicle id={name} depart="{depart:.2f}"{speed}{vehicles.heads[index]}'
-                    f"{vehicles.tail(index, depart - vehicles.depart_s[index])}</vehicle>",
-                )
-            )
+        rows += [
+            (departs[index], vehicles.row(index, suffix, departs[index], factors[index]))
+            for index in np.flatnonzero(copies > copy).tolist()
+        ]
     rows.sort(key=lambda row: row[0])
     text = "<routes>\n" + "\n".join(row for _, row in rows) + "\n</routes>\n"
     return replace(
@@ -171,6 +171,46 @@ def draw_day(scenario: Scenario, seed: int, day_to_day: float = 0.0) -> Scenario
         routes=(Document(_VEHICLES, None, text.encode()), *vehicles.others),
         additional=(*scenario.additional, vehicles.types),
     )
+
+
+def _reflected(
+    depart_s: NDArray[np.float64], shift_s: NDArray[np.float64], begin_s: float, end_s: float
+) -> NDArray[np.float64]:
+    """Return shifted departures, mirrored at the start and the end of the scenario, s.
+
+    No vehicle crosses the end. None that departs in the scenario gets before the start.
+
+    Args:
+        depart_s: Departures, s, ``(vehicles,)``.
+        shift_s: Their shifts, s, ``(vehicles,)``.
+        begin_s: Start of the scenario, s.
+        end_s: End of the scenario, s.
+    """
+    departs = depart_s + shift_s
+    departs = np.where(departs < begin_s, 2 * begin_s - departs, departs)
+    crosses = (departs >= end_s) != (depart_s >= end_s)
+    departs = np.where(crosses, 2 * end_s - departs, departs)
+    return np.maximum(departs, begin_s)  # in a scenario shorter than the shifts
+
+
+def _speed_factors(
+    speeds: NDArray[np.float64], draws: NDArray[np.float64], again: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return a speedFactor for each vehicle, ``(vehicles,)``; NaN if SUMO draws it.
+
+    Args:
+        speeds: Mean, deviation, least and greatest speedFactor, ``(vehicles, 4)``.
+        draws: Standard normal numbers, ``(vehicles,)``.
+        again: Generator of further ones in place of factors beyond a limit.
+    """
+    mean, deviation, least, greatest = speeds.T
+    least = np.maximum(least, _LEAST_FACTOR)
+    factors = mean + deviation * draws
+    for _ in range(_AGAIN):  # SUMO, too, draws again what lies beyond a limit
+        if not (beyond := (factors < least) | (factors > greatest)).any():
+            break
+        factors = np.where(beyond, mean + deviation * again.standard_normal(len(draws)), factors)
+    return np.clip(factors, least, greatest)
 
 
 def _beside(additional: Iterable[bytes]) -> tuple[ET.Element, set[str]]:
