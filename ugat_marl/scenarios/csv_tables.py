@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError
+from ugat_marl.scenarios.settings import parse_decimal
 
 _QUOTED = re.compile(r'"[^"]*"')
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d+\s*", re.ASCII)
@@ -72,6 +74,14 @@ def rows_of(reader: csv.DictReader[str], path: Path) -> Iterator[dict[str, str]]
             yield row
     except csv.Error as error:
         raise ScenarioError(f"{path}, line {reader.line_num + 1}: not CSV ({error})") from None
+
+
+def number_in(text: str | None) -> float:
+    """Return the number in a cell, as `parse_decimal` reads it; NaN for anything else."""
+    try:
+        return parse_decimal(text or "")
+    except ValueError:
+        return math.nan
 
 
 _FORMULA = "=+-@\t\r"

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import xml.etree.ElementTree as ET
 from collections import defaultdict
 from collections.abc import Collection, Container, Iterable, Mapping, Sequence
@@ -21,7 +20,7 @@ from typing import NamedTuple
 
 from ugat_marl.errors import ScenarioError, nearest
 from ugat_marl.files import Document, read_bytes, write_whole, xml_bytes
-from ugat_marl.scenarios.csv_tables import as_text, columns_of, delimiter_of, rows_of
+from ugat_marl.scenarios.csv_tables import as_text, columns_of, delimiter_of, number_in, rows_of
 from ugat_marl.scenarios.junctions import Link
 from ugat_marl.scenarios.network import Intersection, Network
 from ugat_marl.scenarios.phases import (
@@ -35,7 +34,6 @@ from ugat_marl.scenarios.phases import (
     turn_of,
 )
 from ugat_marl.scenarios.scenario import Scenario
-from ugat_marl.scenarios.settings import parse_decimal
 from ugat_marl.scenarios.signals import AMBER, GREEN, YELLOW
 from ugat_marl.scenarios.street_names import (
     ALL_DIRECTIONS,
@@ -129,7 +127,6 @@ def check_plan(plan: SignalPlan, source: str) -> None:
             barriers, or the splits do not make the cycle.
     """
     where = f"{source}: light {plan.light!r}"
-    lengths: dict[int, dict[int, float]] = defaultdict(lambda: defaultdict(float))
     for number, phase in enumerate(plan.phases, 1):
         if phase.green_s < 1.0 - _SAME_S:
             raise ScenarioError(
@@ -137,7 +134,7 @@ def check_plan(plan: SignalPlan, source: str) -> None:
                 f"{phase.split_s:g} s, and yellow and all-red take "
                 f"{phase.yellow_s + phase.all_red_s:g} s of it; a second of green is the least"
             )
-        lengths[phase.barrier][phase.ring] += phase.split_s
+    lengths = _ring_lengths_s(plan)
     for barrier, rings in lengths.items():
         if max(rings.values()) - min(rings.values()) > _SAME_S:
             listed = ", ".join(f"ring {ring} {s:g} s" for ring, s in sorted(rings.items()))
@@ -227,14 +224,20 @@ class _Signals(NamedTuple):
     clearing: set[str]
 
 
+def _ring_lengths_s(plan: SignalPlan) -> dict[int, dict[int, float]]:
+    """Return the sum of splits, s, of each ring before each barrier, by barrier and ring."""
+    lengths: dict[int, dict[int, float]] = defaultdict(lambda: defaultdict(float))
+    for phase in plan.phases:
+        lengths[phase.barrier][phase.ring] += phase.split_s
+    return lengths
+
+
 def phase_times(plan: SignalPlan) -> list[tuple[float, float, float]]:
     """Return start, end of green and end of yellow of each phase, s from the start of the cycle."""
-    rings: dict[int, dict[int, float]] = defaultdict(lambda: defaultdict(float))
-    for phase in plan.phases:
-        rings[phase.barrier][phase.ring] += phase.split_s
+    lengths = _ring_lengths_s(plan)
     begins = {
-        barrier: sum(max(own.values()) for other, own in rings.items() if other < barrier)
-        for barrier in rings
+        barrier: sum(max(rings.values()) for other, rings in lengths.items() if other < barrier)
+        for barrier in lengths
     }
     passed: dict[tuple[int, int], float] = defaultdict(float)
     times: list[tuple[float, float, float]] = []
@@ -252,11 +255,8 @@ def _fitted(plan: SignalPlan) -> SignalPlan:
     The last split of a ring before a barrier takes up what rounding leaves, with more or less
     green. A gap would end the green of movements that stay green across it.
     """
-    lengths: dict[int, dict[int, float]] = defaultdict(lambda: defaultdict(float))
-    last: dict[tuple[int, int], int] = {}
-    for place, phase in enumerate(plan.phases):
-        lengths[phase.barrier][phase.ring] += phase.split_s
-        last[phase.barrier, phase.ring] = place
+    lengths = _ring_lengths_s(plan)
+    last = {(phase.barrier, phase.ring): place for place, phase in enumerate(plan.phases)}
     wanted = {barrier: max(rings.values()) for barrier, rings in lengths.items()}
     wanted[max(wanted)] += plan.cycle_s - sum(wanted.values())
     phases = list(plan.phases)
@@ -753,10 +753,7 @@ def _phase(row: Mapping[str, str | None], where: str) -> PlanPhase:
 
 def _seconds(row: Mapping[str, str | None], key: str, where: str) -> float:
     text = row.get(key)
-    try:
-        value = parse_decimal(text or "")
-    except ValueError:
-        value = math.nan
+    value = number_in(text)
     if not 0 <= value <= LONGEST_S:
         raise ScenarioError(f"{where}: {key} = {text!r} is not a time of 0 to {LONGEST_S:g} s")
     return value

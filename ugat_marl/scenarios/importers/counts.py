@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ugat_marl.errors import ScenarioError, first_names, listed, nearest
 from ugat_marl.files import chunks_of, parse_xml, read_bytes, read_xml, write_whole, xml_bytes
 from ugat_marl.progress import Reporter
-from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, rows_of
+from ugat_marl.scenarios.csv_tables import columns_of, delimiter_of, number_in, rows_of
 from ugat_marl.scenarios.importers.count_sheet import (
     FIT_SHEET,
     NAMES,
@@ -306,11 +306,8 @@ def _time_s(values: Mapping[str, str | None], name: str, usual: float, where: st
 
 
 def _number(text: str | None, key: str, where: str) -> float:
-    try:
-        value = parse_decimal(text or "")
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value >= 0):
+    value = number_in(text)
+    if not value >= 0:
         way_out = ""
         if key == "count":
             way_out = (
