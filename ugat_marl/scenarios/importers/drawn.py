@@ -35,6 +35,7 @@ from ugat_marl.scenarios.importers.plan import (
     Road,
     RoadPlan,
     build_network,
+    lattice,
     netconvert_documents,
 )
 from ugat_marl.scenarios.importers.streets import Streets
@@ -531,25 +532,13 @@ def _laid_out(
     def length_m() -> float:
         return round(_even(ranges.spacing_m, random) if irregular else usual_m, 1)
 
-    letters = "ABCDEF"[:columns]
     xs = np.cumsum([0.0, *(length_m() for _ in range(columns - 1))]).tolist()
     ys = np.cumsum([0.0, *(length_m() for _ in range(rows - 1))]).tolist()
     nodes: dict[str, Node] = {}
     segments: list[_Segment] = []
-
-    def add(line: str, chain: Sequence[Node]) -> None:
-        nodes.update((node.id, node) for node in chain if node.id not in nodes)
-        segments.extend(_Segment((a.id, b.id), line) for a, b in pairwise(chain))
-
-    for row, y in enumerate(ys):
-        name = str(row + 1)
-        inner = [Node(letter + name, x, y, True) for letter, x in zip(letters, xs, strict=True)]
-        west = Node(f"west{name}", -length_m(), y, False)
-        add(name, [west, *inner, Node(f"east{name}", xs[-1] + length_m(), y, False)])
-    for letter, x in zip(letters, xs, strict=True):
-        inner = [nodes[f"{letter}{row + 1}"] for row in range(rows)]
-        south = Node(f"south{letter}", x, -length_m(), False)
-        add(letter, [south, *inner, Node(f"north{letter}", x, ys[-1] + length_m(), False)])
+    for line, chain in lattice(xs, ys, length_m):
+        nodes |= {node.id: node for node in chain}
+        segments += [_Segment((a.id, b.id), line) for a, b in pairwise(chain)]
     return nodes, segments
 
 

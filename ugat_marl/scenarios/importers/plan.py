@@ -11,8 +11,9 @@ import math
 import re
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -161,31 +162,41 @@ def grid(
         east_west: Lanes of the roads along the rows, kerb first, each with its turns.
         north_south: Lanes of the roads along the columns, kerb first, each with its turns.
     """
-    names = [letters(number).upper() for number in range(columns)]
     nodes: dict[str, Node] = {}
     roads: dict[str, Road] = {}
-
-    def add(chain: list[Node], lanes: tuple[str, ...]) -> None:
-        for node in chain:
-            nodes[node.id] = node
-        for here, there in zip(chain, chain[1:], strict=False):
+    xs = [column * spacing_m for column in range(columns)]
+    ys = [row * spacing_m for row in range(rows)]
+    for name, chain in lattice(xs, ys, lambda: entry_m):
+        lanes = tuple(east_west if name.isdigit() else north_south)
+        nodes |= {node.id: node for node in chain}
+        for here, there in pairwise(chain):
             for road in (Road(here.id, there.id, lanes), Road(there.id, here.id, lanes)):
                 roads[road.id] = road
-
-    width, height = (columns - 1) * spacing_m, (rows - 1) * spacing_m
-    for row in range(rows):
-        y = row * spacing_m
-        inner = [Node(f"{x}{row + 1}", i * spacing_m, y, True) for i, x in enumerate(names)]
-        west = Node(f"west{row + 1}", -entry_m, y, False)
-        east = Node(f"east{row + 1}", width + entry_m, y, False)
-        add([west, *inner, east], tuple(east_west))
-    for column, letter in enumerate(names):
-        x = column * spacing_m
-        inner = [nodes[f"{letter}{row + 1}"] for row in range(rows)]
-        south = Node(f"south{letter}", x, -entry_m, False)
-        north = Node(f"north{letter}", x, height + entry_m, False)
-        add([south, *inner, north], tuple(north_south))
     return RoadPlan(nodes, roads)
+
+
+def lattice(
+    xs: Sequence[float], ys: Sequence[float], entry_m: Callable[[], float]
+) -> Iterator[tuple[str, list[Node]]]:
+    """Yield the rows of a grid, then its columns: name, and nodes from west or south.
+
+    Rows are called 1, 2, ... and columns A, B, ...; `grid` says how their nodes are called.
+
+    Args:
+        xs: Coordinates of the columns, m.
+        ys: Coordinates of the rows, m.
+        entry_m: Function that returns the length of the next road into the network, m: at the west
+            and the east of each row, then at the south and the north of each column.
+    """
+    names = [letters(number).upper() for number in range(len(xs))]
+    for row, y in enumerate(ys, 1):
+        inner = [Node(f"{name}{row}", x, y, True) for name, x in zip(names, xs, strict=True)]
+        west = Node(f"west{row}", -entry_m(), y, False)
+        yield str(row), [west, *inner, Node(f"east{row}", xs[-1] + entry_m(), y, False)]
+    for name, x in zip(names, xs, strict=True):
+        inner = [Node(f"{name}{row}", x, y, True) for row, y in enumerate(ys, 1)]
+        south = Node(f"south{name}", x, -entry_m(), False)
+        yield name, [south, *inner, Node(f"north{name}", x, ys[-1] + entry_m(), False)]
 
 
 def coordinate(metres: float) -> str:
