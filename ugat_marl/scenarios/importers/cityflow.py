@@ -11,7 +11,6 @@ import functools
 import heapq
 import json
 import math
-import tempfile
 import xml.etree.ElementTree as ET
 from bisect import bisect_left
 from collections import defaultdict
@@ -23,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.errors import ScenarioError, listed
-from ugat_marl.files import parse_xml, read_bytes, write_whole, xml_bytes
+from ugat_marl.files import parse_xml, write_whole, xml_bytes
 from ugat_marl.progress import Reporter, Silent
 from ugat_marl.scenarios.importers.cityflow_roadnet import (
     Crossing,
@@ -34,12 +33,11 @@ from ugat_marl.scenarios.importers.cityflow_roadnet import (
 )
 from ugat_marl.scenarios.importers.long_files import objects
 from ugat_marl.scenarios.importers.making import NETWORK, ROUTES, RoadFiles, RoadSource
-from ugat_marl.scenarios.importers.plan import coordinate
+from ugat_marl.scenarios.importers.plan import build_network, coordinate
 from ugat_marl.scenarios.importers.turning_shares import MOST_VEHICLES, Drive, write_drives
 from ugat_marl.scenarios.junctions import links_of
 from ugat_marl.scenarios.phases import RightOfWay, state_of
 from ugat_marl.scenarios.signals import GREEN
-from ugat_marl.scenarios.sumo_tools import netconvert
 
 YELLOW_S, ALL_RED_S = 3.0, 2.0
 LONGEST_CLEARANCE_S = 10.0
@@ -107,21 +105,13 @@ def write_network(net: Roadnet, out: Path) -> list[str]:
         ScenarioError: netconvert refused.
     """
     documents = {
-        "--node-files": _nodes(net),
-        "--edge-files": _edges(net),
-        "--connection-files": _connections(net),
-        "--tllogic-files": _lights(net),
+        "--node-files": xml_bytes(_nodes(net)),
+        "--edge-files": xml_bytes(_edges(net)),
+        "--connection-files": xml_bytes(_connections(net)),
+        "--tllogic-files": xml_bytes(_lights(net)),
     }
-    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
-        arguments: list[str] = []
-        for option, root in documents.items():
-            file = Path(name) / f"{option.strip('-')}.xml"
-            write_whole(file, xml_bytes(root))
-            arguments += [option, str(file)]
-        arguments += ["--no-turnarounds", "true", "--offset.disable-normalization", "true"]
-        arguments += ["--junctions.limit-turn-speed", "-1", "--tls.yellow.time", "3"]
-        netconvert(arguments, Path(name) / "out.net.xml")
-        root = parse_xml(read_bytes(Path(name) / "out.net.xml"), str(out))
+    options = {"junctions.limit-turn-speed": -1, "tls.yellow.time": 3}
+    root = parse_xml(build_network(documents, options, strict=False), str(out))
     notes = _set_programmes(root, net)
     write_whole(out, xml_bytes(root))
     return notes

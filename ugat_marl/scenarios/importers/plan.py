@@ -228,17 +228,20 @@ def netconvert_documents(plan: RoadPlan, speed_mps: float) -> dict[str, bytes]:
     }
 
 
-def build_network(documents: Mapping[str, bytes], options: Mapping[str, Any]) -> bytes:
+def build_network(
+    documents: Mapping[str, bytes], options: Mapping[str, Any], *, strict: bool = True
+) -> bytes:
     """Return the ``.net.xml`` that netconvert makes, without its comment with date and paths.
 
     Args:
-        documents: The documents of `netconvert_documents`.
+        documents: Documents such as those of `netconvert_documents`, by the option that takes them.
         options: Further options of netconvert, without the leading dashes.
+        strict: True to refuse a network of which netconvert warns.
 
     Raises:
-        ScenarioError: netconvert refused or warned; the message quotes it.
+        ScenarioError: netconvert refused, or warned and `strict` is True; the message quotes it.
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(prefix="ugat_marl-") as folder:
         arguments: list[str] = []
         for option, document in documents.items():
             file = Path(folder) / f"{option.strip('-')}.xml"
@@ -251,7 +254,7 @@ def build_network(documents: Mapping[str, bytes], options: Mapping[str, Any]) ->
                 str(value).lower() if isinstance(value, bool) else str(value),
             ]
         output = Path(folder) / "network.net.xml"
-        if warnings := netconvert(arguments, output):
+        if (warnings := netconvert(arguments, output)) and strict:
             raise ScenarioError(f"netconvert: {warnings}")
         return output.read_bytes()
 
