@@ -111,13 +111,9 @@ def late_greens(scenario: Scenario) -> dict[str, float]:
     """Return the late green of traffic lights in s, without those that have none."""
     start_s = QUEUE_START_S if scenario.settings.is_mesoscopic else 0.0
     general = scenario.control.late_green_s + start_s
+    lights = network_places(scenario).lights if general else ()
     tables = scenario.settings.intersections
-    if not general and not tables:
-        return {}
-    late = dict.fromkeys(network_places(scenario).lights, general) if general else {}
-    late |= {
-        tls: x.late_green_s + start_s for tls, x in tables.items() if x.late_green_s is not None
-    }
+    late = {tls: scenario.late_green_s(tls) + start_s for tls in (*lights, *tables)}
     return {tls: seconds for tls, seconds in late.items() if seconds > 0}
 
 

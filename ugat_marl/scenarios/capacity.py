@@ -109,7 +109,7 @@ def degrees_of_saturation(scenario: Scenario, flows_vph: Flows | None = None) ->
     return {
         light.id: _degree(
             _Loaded.of(light, network, rules, flows),
-            clearance_s + _late_green_s(scenario, light.id),
+            clearance_s + scenario.late_green_s(light.id),
         )
         for light in network.intersections
     }
@@ -232,12 +232,6 @@ def _conflicts(
             lanes = len({link.from_lane for link in movements[name]})
             own = PERMITTED_EQUIVALENT * ratios[name] / lanes
             yield used, own + sum(ratios[other] for other in others)
-
-
-def _late_green_s(scenario: Scenario, light: str) -> float:
-    own = scenario.settings.intersections.get(light)
-    late_s = None if own is None else own.late_green_s
-    return scenario.control.late_green_s if late_s is None else late_s
 
 
 def _degree(loaded: _Loaded, clearance_s: float) -> float:

@@ -72,6 +72,12 @@ class Scenario:
         control = self.control
         return SignalTiming(control.yellow_s, control.all_red_s, control.min_green_s)
 
+    def late_green_s(self, light: str) -> float:
+        """Return the late green of a traffic light, s: its own, else that of all."""
+        own = self.settings.intersections.get(light)
+        late_s = None if own is None else own.late_green_s
+        return self.control.late_green_s if late_s is None else late_s
+
     @property
     def decisions(self) -> int:
         """Number of decisions in an episode of the scenario's full duration."""
