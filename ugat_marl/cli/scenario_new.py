@@ -155,7 +155,7 @@ class ScenarioNew:
             command=self._command(),
             force=self.force,
             reporter=reporter,
-            draw=lambda scenario, out: draw_network(scenario, out, reporter),
+            draw=lambda scenario, out: plot_network(scenario, out, reporter),
         )
         agents = len(made.network.intersections)
         phases = sum(len(light.phases) for light in made.network.intersections)
