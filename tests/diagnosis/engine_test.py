@@ -323,7 +323,7 @@ def test_a_day_that_failed_is_tried_again(
 
 
 @pytest.mark.parametrize(
-    "damage", ["empty", "half", "text", "flipped", "encrypted", "method", "other", "head"]
+    "damage", ["empty", "half", "text", "flipped", "encrypted", "method", "lzma", "other", "head"]
 )
 def test_a_damaged_file_is_simulated_again(
     scenario: Scenario, layout: DetectorLayout, tmp_path: Path, damage: str
@@ -335,9 +335,10 @@ def test_a_damaged_file_is_simulated_again(
     flipped = bytearray(content)
     flipped[len(content) // 3 : len(content) // 3 + 40] = bytes(40)
     entry = content.rindex(b"PK\1\2")  # of the archive's directory; flags and method follow
-    encrypted, method = bytearray(content), bytearray(content)
+    encrypted, method, lzma = (bytearray(content) for _ in range(3))
     encrypted[entry + 8] ^= 1
     method[entry + 10] ^= 64
+    lzma[entry + 10] = 14
     if damage == "other":
         with file.open("wb") as stream:
             np.savez(stream, something=np.zeros(3))
@@ -353,6 +354,7 @@ def test_a_damaged_file_is_simulated_again(
             "flipped": flipped,
             "encrypted": encrypted,
             "method": method,
+            "lzma": lzma,
         }
         file.write_bytes(changed[damage])
     again, streets = an_engine(scenario, layout, tmp_path)

@@ -440,6 +440,20 @@ def test_periods_of_nearly_one_time_of_day_are_refused(
         module._fitted_periods(given, periods, THRESHOLDS)
 
 
+def test_near_periods_are_refused_by_the_times_of_their_file() -> None:
+    windows = {"first": (0.0, 3600.0), "second": (0.4, 3600.4), "third": (0.8, 3600.8)}
+    periods = tuple(
+        Period(name, *window, "fit", {}, {"one": SEEN}) for name, window in windows.items()
+    )
+    told = r"'first' from 0.0 to 3600.0 s and 'third' from 0.8 to 3600.8 s are nearly"
+    with pytest.raises(MeasuredDataError, match=told):
+        module._refuse_near_windows(periods, _of_common_windows(periods), THRESHOLDS)
+    short = tuple(
+        Period(str(begin_s), begin_s, begin_s + 300.0, "fit", {}, {}) for begin_s in (0.0, 250.0)
+    )
+    module._refuse_near_windows(short, short, THRESHOLDS)
+
+
 def test_demand_that_varies_from_day_to_day_is_told_from_chance() -> None:
     generator = np.random.default_rng(4)
 

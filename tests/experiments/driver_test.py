@@ -178,6 +178,15 @@ def test_weights_that_are_not_trained_here_get_no_lessons(tmp_path: Path) -> Non
     assert np.array_equal(NetworkPolicy.load(tmp_path / POLICY).parameters, fresh.parameters)
 
 
+@pytest.mark.parametrize(("teacher", "same"), [("best", False), (None, True)])
+def test_a_row_without_lessons_is_another_one_where_there_are_some(
+    teacher: str | None, same: bool
+) -> None:
+    learner = LearnerSpec("universal", dqn=DQNConfig(teacher=teacher))
+    setting = Setting("x", "further", learner=learner)
+    assert (replace(setting, lessons=False).identity == setting.identity) == same
+
+
 def test_the_digest_follows_the_files_of_the_scenario(tmp_path: Path) -> None:
     town = tmp_path / "town"
     load_scenario("single-v1").write(town)

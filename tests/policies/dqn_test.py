@@ -265,7 +265,7 @@ def test_masked_actions_are_never_bootstrapped_from():
     generator = torch.Generator().manual_seed(0)
     for _ in range(500):
         learner.update(generator)
-    values = learner.policy().q_values({"signal_0": state[0]})["signal_0"]
+    values = q_values(learner.policy(), {"signal_0": state[0]})["signal_0"]
     assert values == pytest.approx([2.0, 5.0], abs=0.05)  # 1 / (1 - 0.5); with action 1 it is 3.5
 
 

@@ -790,6 +790,9 @@ def test_values_of_python_arrive_as_they_are(hint: Any, value: Any, text: str) -
     ("hint", "value", "text"),
     [
         (Any, np.float64(0.1), "0.1"),
+        (Any, (np.int64(64), np.int64(32)), "64,32"),
+        (list[float], [np.float64(0.1), np.float64(0.2)], "0.1,0.2"),
+        (dict[str, float], {"rate": np.float64(0.1)}, "{'rate': 0.1}"),
         (float, math.nan, "nan"),
         (tuple[int, ...], [32], "32"),
         (np.ndarray, np.array([1, 2]), "[1, 2]"),
@@ -1041,6 +1044,9 @@ def test_an_error_in_the_file_of_a_policy_is_told_with_its_place(tmp_path: Path)
     says = r"^policy '.*': .*failing\.py, line 2: ZeroDivisionError: division by zero$"
     with pytest.raises(OptionError, match=says):
         load_own(f"{tmp_path}/failing.py:policy", "policy")
+    (tmp_path / "reading.py").write_text("import json\njson.loads('{')\n")
+    with pytest.raises(OptionError, match=r"reading\.py, line 2: JSONDecodeError: "):
+        load_own(f"{tmp_path}/reading.py:policy", "policy")
 
 
 class Unmade:

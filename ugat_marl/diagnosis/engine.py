@@ -8,6 +8,7 @@ import functools
 import hashlib
 import io
 import itertools
+import lzma
 import math
 import threading
 import time
@@ -122,6 +123,7 @@ _DAMAGED = (
     MemoryError,
     RuntimeError,
     SyntaxError,
+    lzma.LZMAError,
     tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,

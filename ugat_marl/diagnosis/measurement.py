@@ -223,7 +223,7 @@ class Measurement:
     def errors(self, left_out: Collection[str] = ()) -> tuple[DetectorError, ...]:
         """Return the errors of measurement that are beyond chance and large enough to matter.
 
-        None is returned if the stamps are `too_coarse`.
+        There are none if the stamps are `too_coarse`.
 
         Args:
             left_out: Names of effects that are not examined.

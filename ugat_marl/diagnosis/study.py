@@ -664,7 +664,7 @@ def _fitted_periods(
     if not (periods := measured.of("fit")):
         raise MeasuredDataError("no period has the split 'fit'; there is nothing to fit")
     _refuse_lengths(given, measured.periods, thresholds)
-    _refuse_near_windows(measured.periods, thresholds)
+    _refuse_near_windows(given, measured.periods, thresholds)
     return periods
 
 
@@ -758,23 +758,30 @@ def _near(one: tuple[float, float], other: tuple[float, float], apart_s: float) 
     return all(abs(a - b) <= apart_s for a, b in zip(one, other, strict=True))
 
 
-def _refuse_near_windows(common: Sequence[Period], thresholds: Thresholds) -> None:
+def _refuse_near_windows(
+    given: Sequence[Period], common: Sequence[Period], thresholds: Thresholds
+) -> None:
     """Refuse overlapping periods of nearly one time of day: each would be a stretch of its own.
 
     Args:
-        common: The periods in common windows.
+        given: The periods as they were given.
+        common: The same periods in common windows.
         thresholds: Numbers of the method.
 
     Raises:
-        MeasuredDataError: Two windows overlap and differ by at most a bin of time.
+        MeasuredDataError: Two windows differ by at most a bin of time, and by less than half of
+            their length.
     """
-    names = {period.window: period.id for period in reversed(common)}
-    for one, other in itertools.combinations(sorted(names), 2):
-        if other[0] < one[1] and _near(one, other, thresholds.bin_s):
+    first = {period.window: number for number, period in reversed([*enumerate(common)])}
+    for one, other in itertools.combinations(sorted(first), 2):
+        if other[0] < sum(one) / 2.0 and _near(one, other, thresholds.bin_s):
+            two = " and ".join(
+                f"{period.id!r} from {period.begin_s} to {period.end_s} s"
+                for period in (given[first[one]], given[first[other]])
+            )
             raise MeasuredDataError(
-                f"periods.csv: {names[one]!r} from {one[0]} to {one[1]} s and {names[other]!r} "
-                f"from {other[0]} to {other[1]} s are nearly the same time of day; give both the "
-                "same begin_s and end_s"
+                f"periods.csv: {two} are nearly the same time of day; give both the same begin_s "
+                "and end_s"
             )
 
 

@@ -19,6 +19,7 @@ from ugat_marl.policies import (
     is_savable,
     learner_factory,
     learner_library,
+    lesson_episodes,
     load_own,
     observed_options,
     own_source,
@@ -215,6 +216,9 @@ class Setting:
             parts["change_cost"] = CHANGE_COST
         if self.commands:
             parts["commands"] = self.commands
-        if not self.lessons:
+        learner = self.learner
+        if not self.lessons and (
+            self.recipe == "untrained" or lesson_episodes(learner.name, learner.dqn)
+        ):
             parts["lessons"] = 0
         return parts

@@ -64,7 +64,7 @@ def setting_text(name: str, value: Any, hint: Any) -> str:
     Raises:
         OptionError: No text is read as the value.
     """
-    plain = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+    plain = _without_numpy(value)
     usual = ",".join(map(str, plain)) if isinstance(plain, list | tuple) else str(plain)
     try:
         wanted = TypeAdapter(hint).validate_python(plain)
@@ -77,9 +77,20 @@ def setting_text(name: str, value: Any, hint: Any) -> str:
             if _is_same(_converted(text, hint), wanted):
                 return f"{name}={text}"
     raise OptionError(
-        f"learner setting {name} = {value!r}: a run keeps settings as text, from which this value "
-        "is not read again; give plain data, or functools.partial(CLASS, ...) as the learner"
+        f"learner setting {name} = {value!r}: a run keeps settings as text, and none is read as "
+        "this value; give other plain data, or functools.partial(CLASS, ...) as the learner"
     )
+
+
+def _without_numpy(value: Any) -> Any:
+    """Return a value with numbers and lists of Python in place of NumPy's."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if type(value) in (list, tuple):
+        return type(value)(map(_without_numpy, value))
+    if type(value) is dict:
+        return {key: _without_numpy(item) for key, item in value.items()}
+    return value
 
 
 def _is_same(one: Any, other: Any) -> bool:

@@ -140,7 +140,8 @@ def _naming_errors(given: Any, what: str, env: CountedEnv | None = None) -> Iter
     except Exception as error:
         if env is not None and error is env.ended_by:
             raise
-        kind = given if inspect.isroutine(given) or inspect.isclass(given) else type(given)
+        made = given.func if isinstance(given, functools.partial) else given
+        kind = made if inspect.isroutine(made) or inspect.isclass(made) else type(made)
         said = f"{type(error).__name__}: {error}{_last_line_in(kind, error)}"
         *_, last = traceback.extract_tb(error.__traceback__)
         if (raised := f"{last.filename}, line {last.lineno}") not in said:

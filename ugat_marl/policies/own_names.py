@@ -113,7 +113,9 @@ def load_own(name: str, what: str) -> Any:
     except (UgatMarlError, MemoryError):
         raise
     except Exception as error:
-        *_, last = traceback.extract_tb(error.__traceback__)
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [frame for frame in frames if file and Path(frame.filename) == file]
+        last = (own or frames)[-1]
         where = f"{last.filename}, line {last.lineno}"
         said = f"{type(error).__name__}: {first_line(error)}"
         raise OptionError(f"{what} {name!r}: {where}: {said}") from error
