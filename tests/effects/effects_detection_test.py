@@ -107,6 +107,9 @@ def test_an_extension_merges_vehicles_that_follow_closely() -> None:
     assert merged.passages["far"].length_m.tolist() == [4, 6, 7]
     whole = DetectorExtension("far", 9.0, "merged").observe(day, DETECTORS, {})
     assert times(whole, "far") == [(10, 30)]
+    stands = period(far=passages([10, 12, 17], [19, 13, 18]))
+    merged = DetectorExtension("far", 1.0, "merged").observe(stands, DETECTORS, {})
+    assert times(merged, "far") == [(10, 20)], "who came before the others and leaves after them"
 
 
 def test_an_extension_is_taken_off_again() -> None:

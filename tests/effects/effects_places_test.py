@@ -187,6 +187,8 @@ def test_parking_at_other_times_is_as_frequent_and_as_long(
     scenario = apply_effects(load_scenario(directory), [Parking("S_C_0", 180, 5)])
     one, again, other = (shift_parking(scenario, seed) for seed in (1, 1, 2))
     assert len(parked(scenario)) == 10  # 200 s of 180 an hour
+    parts = (np.array(parked(scenario)) - begin_s) // 20.0
+    assert parts.tolist() == [*range(10)], "one in each 20 s"
     for day in (one, other):
         assert len(parked(day)) == 10
         assert all(begin_s <= time < begin_s + 200.0 for time in parked(day))

@@ -232,6 +232,16 @@ def test_the_longest_green() -> None:
     assert greens == [35] * 4
 
 
+def test_a_green_is_not_too_long_before_it_begins() -> None:
+    """The green begins in 1 s and is 7 s old 8 s from now."""
+    timing = signals.SignalTiming(5.0, 4.0, 5.0)
+    made = Actuators.of(parse_domain("max_green=10"), NETWORKS["single-v1"], timing, 8.0)
+    assert made is not None
+    made.reset(1)
+    (mask,) = made.masks([signals.SignalState(phase=1, origin=0, elapsed_s=8.0)])
+    assert mask[1]
+
+
 def test_what_is_too_long_follows_the_order_of_phases() -> None:
     light = Light("max_green=10+phase_order=barrier-both")
     found = [light.step(light.state.phase) for _ in range(6)]

@@ -72,6 +72,13 @@ def test_service_of_one_lane_is_found_at_this_lane() -> None:
     assert np.delete(found[:, 0], 3).max() < 1.0
 
 
+def test_lanes_deviate_from_the_network_s_mean_by_0_on_average() -> None:
+    found = Posterior.fit(WORLDS, SIMULATED, summary(WORLDS.draw(5), 5, silent=2))
+    assert np.abs(found.offsets_s).max() > 0.01
+    assert found.offsets_s.mean(0) == pytest.approx(0.0, abs=1e-9)
+    assert found.offset_errors_s.mean(1) == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_lane_without_data_follows_the_network_and_is_less_certain() -> None:
     truth = WorldValues(
         np.array([x.nominal for x in WORLDS.library]), np.full((len(LANES), 2), 2.0)

@@ -57,11 +57,17 @@ def test_greens_are_told_apart_by_their_age(
     assert fall(log, "is long") == pytest.approx(is_long)
 
 
-def test_a_missing_decision_makes_no_green_older() -> None:
-    """Without its second decision nobody knows that a green went on."""
-    log = log_of(10.0, skipped=1)
-    assert fall(log, "goes on") == pytest.approx((22.0 / 10, 10.0))  # the third one took its place
-    assert fall(log, "is long") == pytest.approx((4.0, 19.0))
+@pytest.mark.parametrize(
+    ("skipped", "goes_on", "is_long"),
+    [(1, (22.0 / 10, 10.0), (4.0, 19.0)), (2, (24.0 / 11, 11.0), (4.0, 18.0))],
+)
+def test_a_missing_decision_makes_no_green_older(
+    skipped: int, goes_on: tuple[float, float], is_long: tuple[float, float]
+) -> None:
+    """Without a decision nobody knows that a green went on: the next one takes its place."""
+    log = log_of(10.0, skipped)
+    assert fall(log, "goes on") == pytest.approx(goes_on)
+    assert fall(log, "is long") == pytest.approx(is_long)
 
 
 def rows_of(counts: list[float], served: list[float]) -> LaneRows:

@@ -15,7 +15,7 @@ import ugat_marl
 from ugat_marl.data import AgentLayout
 from ugat_marl.envs.commands import memory_size
 from ugat_marl.errors import ActionError, OptionError
-from ugat_marl.grounding import GateConfig, GroundedEnv, PhaseTransform
+from ugat_marl.grounding import GateConfig, GroundedEnv, InputsConfig, PhaseTransform
 from ugat_marl.grounding.transform import GroundedActions
 
 LAYOUTS = {"a_0": AgentLayout(3, 4), "b_0": AgentLayout(2, 2, 1)}
@@ -117,6 +117,35 @@ def test_a_policy_sees_the_commands_it_gave_and_not_the_grounded_ones() -> None:
             assert infos[agent]["grounded_action"] == 3
     finally:
         inner.close()
+
+
+def test_models_see_the_phases_that_ran_and_those_that_were_asked_for() -> None:
+    class Slow(Crossing):
+        """Its lights show phase 1, whatever they are told."""
+
+        def _outcome(self):
+            observations, infos = super()._outcome()
+            for agent in LAYOUTS:
+                infos[agent]["executed_action"] = 1
+            return observations, infos
+
+    class Seen(PhaseTransform):
+        """Keeps the earlier decisions it is given."""
+
+        def __call__(self, observations, actions, permitted=None, earlier=()):
+            self.earlier = list(earlier)
+            return super().__call__(observations, actions, permitted, earlier)
+
+    made = Seen(LAYOUTS, 0, inputs=InputsConfig(history=2))
+    made.forward.fitted.fill_(True)
+    made.inverse.fitted.fill_(True)
+    env = GroundedEnv(Slow(), made)
+    env.reset(seed=1)
+    for own in ({"a_0": 3, "b_0": 0}, {"a_0": 2, "b_0": 0}):
+        env.step(own)
+    (moment,) = made.earlier
+    assert moment.executed.tolist() == [[1], [1]]
+    assert moment.asked.tolist() == [[3], [0]]
 
 
 def test_the_grounded_action_is_executed_and_told_in_the_infos() -> None:
