@@ -359,6 +359,39 @@ def minus_vehicles(before: rewards.IntersectionView, after: rewards.Intersection
     return -float(after.vehicles.sum())
 
 
+def test_every_reward_is_what_it_says(mixed: TrafficEnv) -> None:
+    lanes = mixed.network.lane_table().ids
+    rng = np.random.default_rng(0)
+
+    def snapshot(time_s: float) -> Snapshot:
+        vehicles, halting, waiting_s, upstream = rng.integers(1, 30, (4, len(lanes))).astype(float)
+        speed_mps = np.ones(len(lanes))
+        return Snapshot(
+            time_s, vehicles, halting, speed_mps, waiting_s, 0, 0, queued_upstream=upstream
+        )
+
+    def on(names: tuple[str, ...], values: np.ndarray) -> float:
+        return sum(values[lanes.index(name)] for name in names)
+
+    before, after = snapshot(0.0), snapshot(10.0)
+    more_in: set[bool] = set()
+    given = {
+        name: rewards.Rewarder(mixed.network, name).rewards(before, after)
+        for name in ("queue", "total-queue", "pressure", "waiting")
+    }
+    for place, item in enumerate(mixed.network.intersections):
+        incoming, outgoing = item.incoming_lanes, item.outgoing_lanes
+        queue, upstream = on(incoming, after.halting), on(incoming, after.queued_upstream)
+        difference = on(incoming, after.vehicles) - on(outgoing, after.vehicles)
+        more_in.add(difference > 0)
+        assert given["queue"][place] == -queue
+        assert given["total-queue"][place] == -queue - upstream
+        assert given["pressure"][place] == -abs(difference)
+        waits_s = [on(incoming, moment.waiting_s) for moment in (before, after)]
+        assert given["waiting"][place] == waits_s[0] - waits_s[1]
+    assert more_in == {True, False}
+
+
 def test_the_reward_may_be_a_function() -> None:
     env = ugat_marl.parallel_env("single-v1", reward=minus_vehicles, duration_s=200)
     seen, _ = env.reset(seed=1)

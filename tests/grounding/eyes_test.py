@@ -113,6 +113,12 @@ def test_a_short_zone_is_found_by_what_is_never_counted() -> None:
     assert eyes.lag == 0
 
 
+def test_what_is_not_certain_is_drawn_in_every_episode() -> None:
+    eyes = replace(found(None), zone_m=(20.0, 60.0))
+    one, again, other = (eyes.parts(seed, VIEW.lanes, 10.0) for seed in (1, 1, 2))
+    assert one == again != other
+
+
 def test_a_zone_is_found_where_most_lanes_are_shorter() -> None:
     """Places cut out of a city have one long lane among several of a vehicle's length."""
     lengths = np.array([30.0, 1.0, 1.0, 1.0])

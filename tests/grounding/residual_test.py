@@ -217,6 +217,24 @@ def test_too_few_decisions_prove_nothing() -> None:
     assert not trust.better.any() and np.isnan(trust.world_error).all()
 
 
+def test_f_and_its_rival_learn_from_as_many_decisions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """240 decisions of the street, and 300 that the world has beside those of the common start."""
+    numbers_of_rows: list[list[float]] = []
+
+    def counted(self: Fitter, model: Any, training_data: Any, rows: Any) -> None:
+        numbers_of_rows.append((rows.train + rows.held_out).sum(1).tolist())
+        model.fitted.fill_(True)
+
+    monkeypatch.setattr(Fitter, "fit_changes", counted)
+    residual = PHASE.residual(LAYOUTS, 0)
+    assert residual is not None
+    log = ByHand(1).collect(None, 0, 0)
+    few = TransitionLog(log.provenance, log.frame.filter(log.frame["step"] < 60))
+    compare(residual.transform, few, log, Fitter(PHASE.fit, 0), TrustConfig())
+    _, *fits = numbers_of_rows
+    assert fits[0::2] == fits[1::2]
+
+
 def test_p_values_take_groups_for_independent_not_their_rows() -> None:
     generator = np.random.default_rng(0)
     group = np.repeat(np.arange(8), 30)
