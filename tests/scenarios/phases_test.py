@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import chain, combinations
 
 import pytest
@@ -13,6 +14,7 @@ from ugat_marl.scenarios import Link, conflicting_greens
 from ugat_marl.scenarios.phases import (
     MOST_PHASES,
     RightOfWay,
+    _shared,
     are_foes,
     conflict_free_phases,
     programme_phases,
@@ -179,10 +181,16 @@ def test_movements_that_share_a_letter_are_green_together() -> None:
     assert set(phases) == {"Grr", "rGr", "rrG"}
 
 
-@pytest.mark.parametrize(("partial", "whole"), [("L", "l"), ("t", "l"), ("R", "r")])
-def test_a_partial_turn_belongs_to_the_turn_it_resembles(partial: str, whole: str) -> None:
+@pytest.mark.parametrize(
+    ("partial", "whole", "left_hand"),
+    [("L", "l", False), ("t", "l", False), ("R", "r", False), ("t", "r", True), ("T", "r", True)],
+)
+def test_a_partial_turn_belongs_to_the_turn_it_resembles(
+    partial: str, whole: str, left_hand: bool
+) -> None:
     """Both are one movement: what crosses one of them stops both."""
     links = [link(0, "a", whole), link(1, "a", partial, 1), link(2, "b", "s"), link(3, "c", "s")]
+    links = [replace(one, left_hand=left_hand) for one in links]
     foes = matrix(4, {(1, 2), (0, 3), (2, 3)})
     assert set(conflict_free_phases(links, RightOfWay(foes), 4, "here")) == {"GGrr", "rrGr", "rrrG"}
 
@@ -249,6 +257,20 @@ def test_left_turns_conflict_where_their_roads_cross() -> None:
     assert conflicting_greens("GrGrrr", links, foes) is None
     assert conflicting_greens("GGrrrr", links, foes) == (0, 1)
     assert conflicting_greens("GGr", links[:3], foes) is None  # nothing tells who is opposite
+
+
+def test_greens_that_merge_do_not_conflict() -> None:
+    links = [link(0, "a", "s", to="x"), link(1, "b", "r", to="x")]
+    assert conflicting_greens("GG", links, matrix(2, {(0, 1)})) is None
+
+
+@pytest.mark.parametrize(("turn", "shares"), [("l", True), ("r", False), ("t", False)])
+def test_a_lane_for_straight_on_is_shared_with_turns_across_opposite_traffic(
+    turn: str, shares: bool
+) -> None:
+    """U-turns are too rare to make the turns of a whole light permitted."""
+    assert _shared([link(0, "a", "s"), link(1, "a", turn)]) == shares
+    assert not _shared([link(0, "a", "s"), link(1, "a", turn, lane=1)])
 
 
 def test_links_of_different_junctions_are_no_foes() -> None:
