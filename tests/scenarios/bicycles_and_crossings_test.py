@@ -140,3 +140,4 @@ def test_a_crossing_stays_green_while_only_the_other_ring_ends(tmp_path: Path) -
             row
         )
     assert sum(row[:35] == "G" * 35 and "G" not in row[35:40] for row in rows) == 2
+    assert sum("G" not in row[:40] and row[40:75] == "G" * 35 for row in rows) == 2, "not before"

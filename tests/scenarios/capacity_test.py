@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import (
+    Link,
     Network,
     NetworkRanges,
     Scenario,
@@ -26,6 +28,7 @@ from ugat_marl.scenarios.capacity import (
     LEFT_HEADWAY_S,
     PERMITTED_EQUIVALENT,
     RIGHT_HEADWAY_S,
+    may_go,
     through_headway_s,
 )
 
@@ -80,6 +83,9 @@ def test_protected_lefts_are_the_critical_sum_of_two_rings(crossing: Scenario) -
     wanted = (pair("west1", "east1") + pair("southA", "northA")) / (1 - lost)
     assert degrees_of_saturation(crossing, flows()) == {"A1": pytest.approx(wanted)}
     assert degrees_of_saturation(crossing, flows(2)) == {"A1": pytest.approx(2 * wanted)}
+    late = crossing.with_control(late_green_s=2.0)
+    wanted *= (1 - lost) / (1 - lost - 4 * 2.0 / CYCLE_S)
+    assert degrees_of_saturation(late, flows()) == {"A1": pytest.approx(wanted)}
 
 
 def test_permitted_lefts_add_to_the_traffic_opposite(crossing: Scenario) -> None:
@@ -114,6 +120,12 @@ def test_traffic_without_green_is_beyond_any_capacity(crossing: Scenario) -> Non
     assert degrees_of_saturation(red, flows()) == {"A1": math.inf}
 
 
+def test_a_lane_is_served_if_all_its_traffic_may_go() -> None:
+    links = [Link(number, "a_0", f"b{number}_0", turn) for number, turn in enumerate("sr")]
+    served = {phase: may_go(links, phase) for phase in ("GG", "Gg", "Gs", "Gr", "rs")}
+    assert served == {"GG": True, "Gg": True, "Gs": True, "Gr": False, "rs": False}
+
+
 def test_lanes_share_a_movement(tmp_path: Path) -> None:
     ranges = NetworkRanges(
         intersections=(1, 1), lanes=(3, 3), left_lanes=1, irregular=0, permitted=0
@@ -125,11 +137,13 @@ def test_lanes_share_a_movement(tmp_path: Path) -> None:
     assert degrees_of_saturation(wide, only) == {"A1": pytest.approx(wanted)}
 
 
-def test_routes_are_counted_within_the_episode(crossing: Scenario) -> None:
+@pytest.mark.parametrize("begin_s", [0.0, 200.0])
+def test_routes_are_counted_within_the_episode(crossing: Scenario, begin_s: float) -> None:
     counted: Counter[tuple[str, str]] = Counter()
     for _, depart_s, edges in departures(crossing, routed=True):
-        counted.update(pairwise(edges) if depart_s < 300 else ())
-    short = crossing.with_duration(300)
+        counted.update(pairwise(edges) if begin_s <= depart_s < begin_s + 300 else ())
+    late = crossing.settings.model_copy(update={"begin_s": begin_s})
+    short = replace(crossing, settings=late).with_duration(300)
     vph = {movement: 12.0 * count for movement, count in counted.items()}
     assert degrees_of_saturation(short) == degrees_of_saturation(short, vph)
     assert degrees_of_saturation(short) != degrees_of_saturation(crossing)
