@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 
@@ -13,7 +14,7 @@ from ugat_marl.data import CSV_HASHES, MeasuredData, as_counts, read_measured, w
 from ugat_marl.data.measured.coverage import COUNTABLE, SUMMED
 from ugat_marl.effects import known_effects
 from ugat_marl.errors import MeasuredDataError
-from ugat_marl.scenarios import Network, Scenario
+from ugat_marl.scenarios import Detector, Network, Passages, Period, Scenario
 
 
 def sums() -> MeasuredData:
@@ -29,6 +30,25 @@ def sums() -> MeasuredData:
         "to_edge", pl.lit(90.0).alias("to_m"), pl.lit(40.0).alias("travel_s"),
     )  # fmt: skip
     return replace(whole, turning=turns, travel_times=times)
+
+
+def test_sums_of_passages_by_hand() -> None:
+    """A vehicle counts where its front arrives; one that was there before, where it leaves."""
+    seen = Passages(
+        np.array([np.nan, 10.0, 20.0, 39.0, 48.0]),
+        np.array([3.0, 12.0, 21.0, 42.0, np.nan]),
+        np.array([np.nan, 10.0, np.nan, 6.0, 8.0]),
+        np.full(5, 4.0),
+    )
+    detectors = (Detector("a", "S_C_0", 440.0, 2.0, "advance"),)
+    day = Period("day", 0.0, 50.0, "fit", {}, {"a": seen})
+    counts = as_counts(MeasuredData(detectors, (day,)), 20.0).counts
+    assert counts is not None
+    assert counts.drop("period_id", "detector_id").rows() == [
+        (0.0, 20.0, 2.0, 0.25, 10.0),
+        (20.0, 40.0, 2.0, 0.1, 6.0),
+        (40.0, 50.0, 1.0, 0.4, 8.0),
+    ]
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import sumo
 from ugat_marl.effects import load_scenario
 from ugat_marl.files import Document, Tag
 from ugat_marl.scenarios import Scenario, demand_as_vehicles
-from ugat_marl.scenarios.routes import OwnEdges, departures, scaled_number
+from ugat_marl.scenarios.routes import OwnEdges, departures, driven_routes, scaled_number
 
 Crossing = Callable[..., Path]
 
@@ -130,6 +130,18 @@ def test_departures_with_a_sign_or_a_leading_point_are_times() -> None:
     )
     times = [depart for _, depart, _ in departures(scenario, routed=True)]
     assert times == [0.5, 1000.0, 2000.5]  # the last one is due when the episode ends
+
+
+def test_only_vehicles_of_the_episode_drive_their_routes() -> None:
+    edges = ("west1_A1 A1_B1", "A1_B1 B1_east1", "west1_A1 A1_A2", "A1_A2 A2_B2")
+    vehicles = "".join(
+        f'<vehicle id="{n}" depart="{99 + n}"><route edges="{way}"/></vehicle>'
+        for n, way in enumerate(edges)
+    )
+    scenario = on_grid(f"<routes>{vehicles}</routes>")
+    span = {"begin_s": 100.0, "duration_s": 2.0}
+    scenario = replace(scenario, settings=scenario.settings.model_copy(update=span))
+    assert list(driven_routes(scenario)) == [tuple(way.split()) for way in edges[1:3]]
 
 
 def test_files_of_two_folders_may_have_one_name(tmp_path: Path) -> None:
