@@ -295,6 +295,14 @@ def test_vehicles_on_lanes_are_those_of_the_last_moment() -> None:
         assert shifted[lane][1:] == counts[:-1]
 
 
+def test_vehicles_below_a_tenth_of_a_metre_per_second_halt() -> None:
+    rows = crowd(1.0, 0.0).head(3).with_columns(time_s=20.0, lane_id=pl.lit("l_0"))
+    rows = rows.with_columns(speed_mps=pl.Series([0.0, 0.09, 0.1]))
+    (row,) = traffic_of_lanes(rows, ["l_0"], DAY).filter(pl.col("time_s") == 20.0).rows(named=True)
+    assert (row["vehicles"], row["halting"]) == (3.0, 2.0)
+    assert row["mean_speed_mps"] == pytest.approx(0.19 / 3, abs=1e-3)
+
+
 @pytest.mark.parametrize(("step_s", "offset_s"), [(1.0, 0.5), (2.0, 1.0), (0.04, 0.017)])
 def test_other_moments_change_vehicles_on_lanes_by_those_who_cross(
     step_s: float, offset_s: float

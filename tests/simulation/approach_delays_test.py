@@ -137,6 +137,9 @@ def test_the_numbers_of_sumo_are_added_up(tmp_path: Path) -> None:
     )
     roads = {"a": frozenset({"a", ":j_0", "up"}), "b": frozenset({"b"})}
     assert read_approach_delays(file, roads) == {"a": (4.0, 12.0), "b": (0.0, 0.0)}
+    blockers = tmp_path / "b.xml"
+    blockers.write_text('<meandata><edge id="a" timeLoss="12" left="1"/></meandata>')
+    assert read_approach_delays(file, roads, blockers)["a"] == (3.0, 12.0)
     file.write_text("<meandata><interval>")
     with pytest.raises(SimulatorError, match="data on roads cannot be read"):
         read_approach_delays(file, roads)

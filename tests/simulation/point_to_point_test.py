@@ -45,6 +45,14 @@ def test_a_vehicle_that_stands_on_the_first_place_leaves_it_once(tmp_path: Path)
     assert seen.tolist() == [[10.0, 50.0]]
 
 
+def test_a_vehicle_that_comes_round_is_timed_from_its_last_visit(tmp_path: Path) -> None:
+    events = [event(0, 10.0, "a"), event(0, 200.0, "a"), event(1, 205.0, "a")]
+    file = tmp_path / "places.xml"
+    file.write_text("\n".join(events))
+    (seen,) = read_between(file, [(HERE, THERE)], 0.0, 900.0)
+    assert seen.tolist() == [[200.0, 5.0]]
+
+
 def test_no_vehicles_are_no_rows(tmp_path: Path) -> None:
     file = tmp_path / "places.xml"
     file.write_text("<instantE1/>")

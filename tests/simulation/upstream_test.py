@@ -77,14 +77,15 @@ def test_each_vehicle_belongs_to_the_next_light_of_its_route() -> None:
             "left": ("e_0", 0.05, ("e", "a", "y")),
             "drives": ("e_0", 5.0, ("e", "a", "y")),
             "other light": ("f_0", 0.0, ("f", "b", "x")),
+            "between two lights": ("f_0", 0.0, ("a", "y", "f", "b", "x")),
             "waits outside": ("", 0.0, ("e", "f", "b", "x")),
             "at the light": ("a_1", 0.0, ("a", "y")),  # counted by the lane itself
             "past the last light": ("x_0", 0.0, ("a", "x")),
             "meets no light": ("", 0.0, ("e", "f")),
         }
     )
-    assert queued(roads) == [0.5, 1.5, 2.0, 0.0]
-    assert sum(queued(roads, backlog=0)) == 3.0, "SUMO says that nobody waits outside"
+    assert queued(roads) == [0.5, 1.5, 3.0, 0.0]
+    assert sum(queued(roads, backlog=0)) == 4.0, "SUMO says that nobody waits outside"
 
 
 def test_what_a_reach_counts_is_left_out() -> None:
