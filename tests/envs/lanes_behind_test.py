@@ -121,6 +121,20 @@ def test_the_field_loop_tells_who_halts_behind_from_who_drives(split: Scenario) 
     assert seen(7.0, 4.0) == seen(4.0, 4.0) != seen(7.0, 7.0)
 
 
+def test_the_field_loop_counts_of_a_shared_lane_its_part(split: Scenario) -> None:
+    site = Site.of(split, {"observation": "movements"})
+    lanes = site.network.lanes
+    half = replace(lanes["wM_0"], behind=Upstream(lanes={"Ww_0": 0.5}))
+    shared = replace(site, network=replace(site.network, lanes={**lanes, "wM_0": half}))
+
+    def seen(by: Site, vehicles: float, halting: float) -> list[float]:
+        counts = {"Ww_0": LaneCount(60.0, vehicles, halting)}
+        (observed,) = by.observe(counts, 60.0, [0]).values()
+        return observed.tolist()
+
+    assert seen(shared, 6.0, 4.0) == seen(site, 3.0, 2.0)
+
+
 def test_a_rule_serves_them(split: Scenario) -> None:
     env = ugat_marl.parallel_env(split, observation="movements")
     rule = make_rule("largest-queue:10", env)

@@ -98,6 +98,28 @@ def test_a_loop_that_cannot_see_its_lights_makes_such_a_light_unsafe() -> None:
     assert broken_rules(street.by_second)
 
 
+def test_a_light_that_shows_neither_state_after_a_command_is_at_fault_at_once() -> None:
+    class Flashes(MadeUpStreet):
+        """Its first light is yellow everywhere for a moment after a command."""
+
+        flashes = False
+
+        def shown(self) -> Mapping[str, str]:
+            yellow = {LIGHT: "y" * len(PHASES[0])}
+            return self.states | yellow if self.flashes else self.states
+
+        def show(self, states: Mapping[str, str]) -> None:
+            self.flashes = self.time_s == 100.0 and LIGHT in states
+            super().show(states)
+
+        def wait(self, until_s: float) -> None:
+            self.flashes = False
+            super().wait(until_s)
+
+    found = kinds(driven(Flashes()))
+    assert "disobeys" in found[10:13] and {*found[:10]} == {""}
+
+
 @pytest.mark.parametrize("delay_s", [0.5, 1.5])
 def test_a_slow_light_is_waited_for_and_is_no_fault(delay_s: float) -> None:
     class Slow(MadeUpStreet):

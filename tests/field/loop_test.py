@@ -755,13 +755,17 @@ def test_the_street_of_the_page_is_driven() -> None:
     assert not broken_rules(made_up.by_second)
 
 
-def test_a_policy_that_needs_its_last_commands_sees_those_the_loop_gave() -> None:
+@pytest.mark.parametrize("on_plan", [False, True])
+def test_a_policy_that_needs_its_last_commands_sees_those_the_loop_gave(on_plan: bool) -> None:
     """Also those of the plan, while its light was on the plan: they are what is under way."""
     site = Site.of(GRID, {"commands": 2})
     street, policy = MadeUpStreet(site), Scripted()
+    if on_plan:
+        street.spoil = replaced(None)
     loop = FieldLoop(site, policy, street, QUICK)
     made = decide(loop, street, 3)
     loop.close()
+    assert all(bool(decision.fallback) == on_plan for decision in made)
     for place, light in enumerate(site.lights):
         agent = site.observer.agents[place]
         phases = len(site.network.intersections[place].phases)

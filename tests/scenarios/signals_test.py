@@ -327,6 +327,11 @@ def test_a_green_shorter_than_its_delay_is_not_shown_nor_its_yellow() -> None:
         assert with_late_green([(9, "Gr")], 3, 1, state)[1] == [(3, "rr"), (6, "Gr")]
 
 
+def test_a_late_green_keeps_the_right_on_red_before_it() -> None:
+    _, shown = with_late_green([(10, "GG")], 2, 1, LateGreenMemory.after("sr"))
+    assert shown == [(2, "sr"), (8, "GG")]
+
+
 def test_half_a_second_is_given_to_every_other_green() -> None:
     state, lost = LateGreenMemory.after("G"), []
     for _ in range(6):
