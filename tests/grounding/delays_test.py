@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ from ugat_marl.grounding import SimulatedWorld, TimedConfig, TimedTransform, Uga
 from ugat_marl.grounding.delays import (
     CHANCE,
     EpisodeRewards,
+    ModelErrors,
+    _between,
     chance_of,
     episode_rewards,
     falling,
@@ -94,6 +97,42 @@ def test_rewards_are_means_of_episodes_in_the_order_that_is_asked_for() -> None:
     silent = (pl.col("agent") == "b_0") & (pl.col("episode") == 1)
     log = TransitionLog(log.provenance, log.frame.filter(~silent))
     assert episode_rewards(log, ["b_0", "a_0"]).tolist() == [[1.5, 5.0], [1.5, 8.0]]
+
+
+def test_rows_at_a_delay_lie_between_those_of_whole_seconds() -> None:
+    rows = torch.tensor([[1.0, 3.0, 7.0]])
+    found = [_between(rows, seconds).item() for seconds in (0.0, 0.25, 1.5, 2.0)]
+    assert found == pytest.approx([1.0, 1.5, 5.0, 7.0])
+
+
+def test_errors_of_a_model_are_those_of_the_rows_with_weight() -> None:
+    """It predicts no change; the second agent has two rows, and two of padding."""
+    change = torch.tensor([[1.0, -1.0, 3.0, 3.0], [2.0, -2.0, 9.0, 9.0]])[..., None]
+    delay_s = torch.tensor([[0.0, 1.2, 1.0, 5.0], [2.0, 0.4, 0.0, 0.0]])
+    executed = torch.tensor([[0, 0, 1, 1], [1, 0, 0, 0]])
+    weight = torch.tensor([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 0.0]])
+    data: Any = SimpleNamespace(
+        observation=None, outcome=change, delay_s=delay_s, executed=executed, weight=weight
+    )
+
+    class Nothing:
+        stack, view = SimpleNamespace(actions=2), SimpleNamespace(of=lambda data: None)
+        most_s, scale = 2, 1.0
+
+        def change(self, observation: None, outcome: torch.Tensor) -> torch.Tensor:
+            return outcome
+
+        def extra(self, delay_s: torch.Tensor) -> torch.Tensor:
+            return delay_s
+
+        def __call__(self, seen: None, executed: Any, extra: torch.Tensor) -> torch.Tensor:
+            return torch.zeros(*extra.shape, 1)
+
+    model: Any = Nothing()
+    errors = ModelErrors.of(model, data)
+    assert errors.spread.flatten().tolist() == pytest.approx([math.sqrt(5.0), 2.0])
+    by_second = [[[1.0, 1.0, 0.0], [0.0, 1.0, 1.0]], [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]
+    assert errors.rows.tolist() == by_second
 
 
 def twice(curve: Floats) -> Floats:

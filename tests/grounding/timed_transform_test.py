@@ -22,6 +22,7 @@ from ugat_marl.grounding import (
     TimedConfig,
     TimedTransform,
 )
+from ugat_marl.grounding.delays import EpisodeRewards, LostTime
 from ugat_marl.grounding.forward import DelayedForward, ForwardConfig
 from ugat_marl.grounding.inverse import DelayModel
 from ugat_marl.grounding.stacked import StackedTransitions
@@ -237,6 +238,21 @@ def test_f_is_compared_where_a_green_was_asked_for_that_begins() -> None:
     changes, compared = transform().training_data(data)
     assert torch.equal(changes.action, asked)
     assert compared.tolist() == [[1.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+
+
+def test_constant_delays_are_set_where_models_have_learnt_something() -> None:
+    """All rewards are those of greens late by 4 s, beside a lost time of 0.5 s and of 1 s."""
+    curve = np.array([-10.0, -12.0, -14.0, -17.0, -20.0])
+    paid = EpisodeRewards(np.full((2, 2), -20.0), np.ones((5, 2, 2)) * curve[:, None, None])
+    lost = LostTime(
+        USUAL_S, np.array([0.5, 1.0]), np.full(2, 0.2), np.full(2, 2.0), np.full(2, 100)
+    )
+    for learnt, beyond_s in (([True, True], [3.5, 3.0]), ([True, False], [3.5, 0.0])):
+        made = transform()
+        matched = made._set_constants(lost, np.array(learnt), paid)
+        assert matched is not None and matched.beyond_s.tolist() == beyond_s
+        assert made.constants.beyond_s.flatten().tolist() == beyond_s
+        assert torch.equal(made.constants.delay_s, USUAL_S * torch.tensor(learnt)[:, None])
 
 
 def test_constant_delays_of_other_agents_are_taken_away() -> None:
