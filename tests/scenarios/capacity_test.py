@@ -28,6 +28,8 @@ from ugat_marl.scenarios.capacity import (
     LEFT_HEADWAY_S,
     PERMITTED_EQUIVALENT,
     RIGHT_HEADWAY_S,
+    _conflicts,
+    _equivalents,
     may_go,
     through_headway_s,
 )
@@ -104,6 +106,27 @@ def test_permitted_lefts_add_to_the_traffic_opposite(crossing: Scenario) -> None
     lost = 2 * permitted.timing.clearance_s / CYCLE_S
     wanted = (pair("west1", "east1") + pair("southA", "northA")) / (1 - lost)
     assert degrees_of_saturation(permitted, flows()) == {"A1": pytest.approx(wanted)}
+
+
+def test_turns_that_give_way_on_two_lanes_share_the_point_of_conflict() -> None:
+    left = [Link(number, f"a_{number}", f"x_{number}", "l") for number in range(2)]
+    opposite = [Link(2, "b_0", "y_0", "s")]
+    turns, straight = ("a", "x"), ("b", "y")
+    (found,) = _conflicts(
+        ("ggG", "rrG", "rrr"),
+        {turns: left, straight: opposite},
+        {turns: 0.1, straight: 0.3},
+        {turns: [straight], straight: []},
+    )
+    assert found[0].tolist() == [True, True, False]
+    assert found[1] == pytest.approx(PERMITTED_EQUIVALENT * 0.1 / 2 + 0.3)
+
+
+def test_who_gives_way_takes_the_time_of_two_cars_at_least() -> None:
+    speeds_mps = (13.9, 1.0)
+    found = [_equivalents("l", speed_mps, yields=True) for speed_mps in speeds_mps]
+    assert found == [PERMITTED_EQUIVALENT, through_headway_s(1.0) / 2.0]
+    assert _equivalents("l", 13.9, yields=False) == LEFT_HEADWAY_S / 2.0
 
 
 def test_one_phase_loses_no_time(crossing: Scenario) -> None:
