@@ -7,19 +7,24 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 
 from ugat_marl.data import CSV_HASHES, read_measured, write_measured
+from ugat_marl.data.measured.counts import counts_of
 from ugat_marl.data.measured.passages import passages_as_written
+from ugat_marl.data.measured.tables import ROW
+from ugat_marl.data.measured.values import Finding
 from ugat_marl.data.measured.writing import require_replaceable
 from ugat_marl.diagnosis.features import DetectorLayout
 from ugat_marl.effects import load_scenario
 from ugat_marl.errors import MeasuredDataError, OutputError
 from ugat_marl.experiments import policy_factory, record
-from ugat_marl.scenarios import Detector, Network, Passages, Scenario
+from ugat_marl.scenarios import Detector, Network, Passages, Period, Scenario
 from ugat_marl.simulation import detectors_document, read_passages
 
 NAN = np.nan
+FLOATS = {"occupancy": pl.Float64, "mean_speed_mps": pl.Float64}
 
 
 def seen(*rows: tuple[float, float, float, float]) -> Passages:
@@ -50,6 +55,23 @@ def test_vehicles_side_by_side_are_one_passage() -> None:
     np.testing.assert_array_equal(both.off_s, [3.0, 14.0, 15.0, 31.0, NAN])
     np.testing.assert_array_equal(both.speed_mps, [4.0, 10.0, NAN, 9.0, 7.0])
     np.testing.assert_array_equal(both.length_m, [5.0, NAN, 4.0, 6.0, 4.0])
+
+
+def test_a_zone_on_two_lanes_counts_twice_as_many_vehicles_as_one() -> None:
+    day = Period("day", 0.0, 100.0, "fit", {}, {})
+    row = {"period_id": "day", "begin_s": 0.0, "end_s": 100.0, "detector_id": "wide"}
+    cells = row | {"occupancy": None, "mean_speed_mps": None, ROW: 1}
+
+    def findings(zone: Detector, count: float) -> list[Finding]:
+        found: list[Finding] = []
+        frame = pl.DataFrame([cells | {"count": count}], schema_overrides=FLOATS)
+        counts_of(Path("counts.csv"), frame, [day], [zone], found)
+        return found
+
+    assert not findings(ZONE, 120.0)
+    assert "more than a lane serves" in findings(ZONE, 150.0)[0].text
+    with pytest.raises(MeasuredDataError, match="more than one vehicle per second and lane"):
+        findings(replace(ZONE, beside=()), 150.0)
 
 
 def test_a_vehicle_that_stays_until_the_end_hides_all_behind_it() -> None:
