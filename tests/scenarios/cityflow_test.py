@@ -217,6 +217,19 @@ def test_time_between_two_greens_is_that_of_the_phases_between_them(
     assert [length for length, _ in item.programme] == seconds
 
 
+@pytest.mark.parametrize("turned", [0, 1, 2])
+def test_short_greens_are_found_wherever_the_cycle_begins(turned: int, tmp_path: Path) -> None:
+    net = crossroads()
+    phases = [(10, [0, 2]), (10, [0]), (10, [1])]
+    net["intersections"][0]["trafficLight"]["lightphases"] = [
+        {"time": seconds, "availableRoadLinks": links}
+        for seconds, links in (*phases[turned:], *phases[:turned])
+    ]
+    assert main(["scenario", "new", str(tmp_path / "city"), *write(tmp_path, net)]) == 0
+    (item,) = Network.read(read_scenario(tmp_path / "city")).intersections
+    assert sorted(item.phases) == ["GGrg", "GGrr", "rrGr"]
+
+
 def test_links_with_green_on_both_sides_may_go_between_two_greens(tmp_path: Path) -> None:
     """The turn from the south has no green with the third phase, and so not always."""
     net = crossroads()

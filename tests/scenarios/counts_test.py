@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import subprocess
 from collections import Counter
 from itertools import pairwise
@@ -15,7 +16,7 @@ from ugat_marl.errors import ScenarioError
 from ugat_marl.progress import Silent
 from ugat_marl.scenarios import read_scenario, sumo_program
 from ugat_marl.scenarios.importers import counts
-from ugat_marl.scenarios.importers.counts import Row, _closed, _outside, read_rows
+from ugat_marl.scenarios.importers.counts import Row, _about_ends, _closed, _outside, read_rows
 
 
 def made(target: Path, *words: str | Path) -> int:
@@ -434,15 +435,28 @@ def test_turns_that_no_random_route_takes_are_driven(
 
 
 def test_intervals_with_inclusive_ends_touch() -> None:
-    def rows(*spans: tuple[float, float]) -> list[Row]:
-        return [Row(("a",), 5.0, begin, end, line) for line, (begin, end) in enumerate(spans, 2)]
+    def rows(*spans: tuple[float, float], end: str = "") -> list[Row]:
+        return [
+            Row(("a",), 5.0, first, last, line, end=end)
+            for line, (first, last) in enumerate(spans, 2)
+        ]
 
     assert _closed(rows((0, 899), (900, 1799), (0, 899))) == rows((0, 900), (900, 1800), (0, 900))
     for spans in (((0, 900), (900, 1800)), ((0, 600), (900, 1800)), ((0, 3600),)):
         assert _closed(rows(*spans)) == rows(*spans)
-    assert _closed(rows((0, 840), (900, 1740))) == rows((0, 900), (900, 1800))
-    for spans in (((0, 840), (900, 1800)), ((0, 830), (890, 1720)), ((0, 840), (960, 1800))):
-        assert _closed(rows(*spans)) == rows(*spans), "not all are whole minutes of one length"
+    day = functools.partial(rows, end="end = 7:14")
+    given, closed = day((0, 840), (900, 1740)), day((0, 900), (900, 1800))
+    assert _closed(given) == closed
+    (note,) = _about_ends(given, closed)
+    assert note.startswith("2 intervals end a minute before the next one begins (the first: end")
+    assert _closed(rows((0, 840), (900, 1740))) == rows((0, 840), (900, 1740)), "are in seconds"
+    for spans in (
+        ((0, 840), (900, 1800)),  # of two lengths
+        ((0, 60), (120, 180)),  # every second minute
+        ((0, 3600), (3660, 7260)),
+        ((0, 840), (960, 1800)),
+    ):
+        assert _closed(day(*spans)) == day(*spans)
     # a count of the whole episode beside them keeps its end
     assert _closed(rows((0, 899), (900, 1799), (0, 1800))) == rows((0, 900), (900, 1800), (0, 1800))
 

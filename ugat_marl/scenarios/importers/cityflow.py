@@ -12,7 +12,6 @@ import heapq
 import json
 import math
 import xml.etree.ElementTree as ET
-from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -350,14 +349,13 @@ def _green_places(phases: Sequence[tuple[float, frozenset[int]]]) -> list[int]:
 
     A phase is none if it is short and its links have green in the greens before and after it.
     """
-    greens = [place for place, (seconds, _) in enumerate(phases) if seconds > LONGEST_CLEARANCE_S]
-    short = [place for place in range(len(phases)) if place not in greens]
-    short.sort(key=lambda place: -len(phases[place][1]))  # greens have more links than others
-    for place in short:
-        at = bisect_left(greens, place)
-        around = (greens[at - 1], greens[at % len(greens)]) if greens else ()
-        if not around or not all(phases[place][1] <= phases[green][1] for green in around):
-            greens.insert(at, place)
+    greens = list(range(len(phases)))
+    short = [place for place in greens if phases[place][0] <= LONGEST_CLEARANCE_S]
+    for place in sorted(short, key=lambda place: len(phases[place][1])):
+        at = greens.index(place)
+        around = greens[at - 1], greens[(at + 1) % len(greens)]
+        if len(greens) > 1 and all(phases[place][1] <= phases[green][1] for green in around):
+            greens.remove(place)
     return greens
 
 

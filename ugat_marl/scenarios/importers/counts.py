@@ -344,7 +344,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
             drives += list(_not_drawn(rows, drives, streets))
             _require_reached(rows, drives, path)
             write_drives(work / "candidates.rou.xml", drives)
-            rows = _closed(rows)
+            given, rows = rows, _closed(rows)
             filling = _filling(rows, begin_s)
             every = [*filling, *rows]
             grid_s = _grid_s(every, path)
@@ -370,6 +370,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         notes = (
             _summary(fits, path),
             *_on_the_way(rows, sampled, root),
+            *_about_ends(given, rows),
             *_about_times(rows, filling, path, begin_s, end_s),
         )
         return VehicleFiles((ROUTES,), notes, fits=fits)
@@ -509,13 +510,17 @@ def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -
             )
 
 
+_MINUTES_S = (300.0, 600.0, 900.0, 1800.0, 3600.0)
+"""Usual lengths of intervals that are written in minutes, s."""
+
+
 def _closed(rows: Sequence[Row]) -> list[Row]:
     """Return rows whose inclusive ends are moved to the begin of the next interval.
 
     Inclusive ends are one second before that begin (0 to 899, 900 to 1799), or one minute (7:00 to
-    7:14, 7:15 to 7:29). A minute may also be a real gap. It is closed only if all times are whole
-    minutes and all intervals have one length. A gap of a second would be an interval of its own for
-    routeSampler, which would not end. A minute would stay empty.
+    7:14, 7:15 to 7:29). A minute may also be a real gap. It is closed only between times of day,
+    and if all intervals have one of `_MINUTES_S` with it. A gap of a second would be an interval of
+    its own for routeSampler, which would not end. A minute would stay empty.
     """
     begins = sorted({row.begin_s for row in rows})
     gaps = {
@@ -524,8 +529,9 @@ def _closed(rows: Sequence[Row]) -> list[Row]:
         if (place := bisect_left(begins, row.end_s)) < len(begins)
     }
     every = {row.end_s - row.begin_s for row in rows}
-    minutes = not any(row.begin_s % 60 or row.end_s % 60 for row in rows)
-    if gaps != {1.0} and not (gaps == {60.0} and minutes and len(every) == 1):
+    usual = len(every) == 1 and every.pop() + 60.0 in _MINUTES_S
+    of_day = all(":" in row.end for row in rows)
+    if gaps != {1.0} and not (gaps == {60.0} and usual and of_day):
         return list(rows)
     (gap_s,) = gaps
     lengths = {row.end_s - row.begin_s for row in rows if row.end_s + gap_s in begins}
@@ -784,6 +790,17 @@ def from_od(path: Path, begin_s: float, length_s: float, seed: int) -> VehicleSo
 
 _USUAL_S = 900.0
 """Counts are of multiples of this time, s."""
+
+
+def _about_ends(given: Sequence[Row], closed: Sequence[Row]) -> Iterator[str]:
+    """Yield a note if `_closed` moved ends by a minute, which may have been without counts."""
+    moved = [old for old, new in zip(given, closed, strict=True) if new.end_s - old.end_s > 1.0]
+    if moved:
+        yield (
+            f"{len(moved)} intervals end a minute before the next one begins (the first: "
+            f"{moved[0].end}); that minute is taken for theirs. If it was not counted, give their "
+            "ends in seconds"
+        )
 
 
 def _about_times(
