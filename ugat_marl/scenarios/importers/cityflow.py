@@ -347,15 +347,18 @@ def _split(crossing: Crossing) -> list[_Green]:
 def _green_places(phases: Sequence[tuple[float, frozenset[int]]]) -> list[int]:
     """Return the positions of the green phases, in their order.
 
-    A phase is none if it is short and its links have green in the greens before and after it.
+    A phase is none if it is short, its links have green in the greens before and after it, and one
+    of these has more. Those with the fewest links go first: a time without green is no neighbour.
     """
     greens = list(range(len(phases)))
-    short = [place for place in greens if phases[place][0] <= LONGEST_CLEARANCE_S]
-    for place in sorted(short, key=lambda place: len(phases[place][1])):
-        at = greens.index(place)
-        around = greens[at - 1], greens[(at + 1) % len(greens)]
-        if len(greens) > 1 and all(phases[place][1] <= phases[green][1] for green in around):
-            greens.remove(place)
+
+    def is_between(at: int) -> bool:
+        seconds, links = phases[greens[at]]
+        before, after = (phases[greens[n % len(greens)]][1] for n in (at - 1, at + 1))
+        return seconds <= LONGEST_CLEARANCE_S and before | after != links <= before & after
+
+    while between := [at for at in range(len(greens)) if is_between(at)]:
+        del greens[min(between, key=lambda at: len(phases[greens[at]][1]))]
     return greens
 
 
