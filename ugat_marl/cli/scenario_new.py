@@ -146,7 +146,6 @@ class ScenarioNew:
         roads, vehicles = self._sources()
         if vehicles is None and not self._brings_vehicles():
             return self._draft(roads, console)
-        reporter = Bars(console)
         made = make_scenario(
             self.name,
             roads,
@@ -154,8 +153,8 @@ class ScenarioNew:
             settings=self._settings(),
             command=self._command(),
             force=self.force,
-            reporter=reporter,
-            draw=lambda scenario, out: plot_network(scenario, out, reporter),
+            reporter=Bars(console),
+            draw=plot_network,
         )
         agents = len(made.network.intersections)
         phases = sum(len(light.phases) for light in made.network.intersections)
@@ -182,7 +181,7 @@ class ScenarioNew:
             settings=self._settings(),
             command=self._command(),
             force=self.force,
-            draw=lambda scenario, out: plot_network(scenario, out, reporter),
+            draw=plot_network,
             reporter=reporter,
         )
         sheet = shlex.quote(str(draft.sheet))

@@ -18,7 +18,6 @@ import io
 import json
 import sys
 import tempfile
-import traceback
 import warnings
 import zipfile
 from collections import deque
@@ -49,7 +48,7 @@ from ugat_marl.files import (
     write_whole,
 )
 from ugat_marl.policies.learner_settings import parsed_settings, setting_name
-from ugat_marl.policies.own_names import load_own
+from ugat_marl.policies.own_names import last_line, line_in, load_own
 from ugat_marl.policies.protocols import EpisodeCallback, Policy
 from ugat_marl.policies.saved_options import other_observation, plain_options
 from ugat_marl.seeding import derive_seed
@@ -143,8 +142,7 @@ def _naming_errors(given: Any, what: str, env: CountedEnv | None = None) -> Iter
         made = given.func if isinstance(given, functools.partial) else given
         kind = made if inspect.isroutine(made) or inspect.isclass(made) else type(made)
         said = f"{type(error).__name__}: {error}{_last_line_in(kind, error)}"
-        *_, last = traceback.extract_tb(error.__traceback__)
-        if (raised := f"{last.filename}, line {last.lineno}") not in said:
+        if (raised := last_line(error)) not in said:
             said += f", raised in {raised}"
         raise _Raised(f"{what}: {said}") from error
 
@@ -702,9 +700,8 @@ def _last_line_in(kind: Any, error: BaseException) -> str:
         file = inspect.getsourcefile(kind)
     except TypeError:  # a class without a source
         return ""
-    frames = traceback.extract_tb(error.__traceback__)
-    lines = [frame.lineno for frame in frames if frame.filename == file]
-    return f" ({file}, line {lines[-1]})" if lines else ""
+    line = line_in(file, error)
+    return line and f" ({line})"
 
 
 def _sees_infos(act: Callable[..., Any]) -> bool:

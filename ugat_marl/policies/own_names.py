@@ -113,15 +113,25 @@ def load_own(name: str, what: str) -> Any:
     except (UgatMarlError, MemoryError):
         raise
     except Exception as error:
-        frames = traceback.extract_tb(error.__traceback__)
-        own = [frame for frame in frames if file and Path(frame.filename) == file]
-        last = (own or frames)[-1]
-        where = f"{last.filename}, line {last.lineno}"
+        where = (file and line_in(str(file), error)) or last_line(error)
         said = f"{type(error).__name__}: {first_line(error)}"
         raise OptionError(f"{what} {name!r}: {where}: {said}") from error
     found = _member(found, path, f"{what} in {module_name}", of_learners=what == "learner")
     _file_hash(_named(found))  # keeps it
     return found
+
+
+def line_in(file: str | None, error: BaseException) -> str:
+    """Return the last line of a file that an error came through, as "FILE, line 7"; "" if none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if frame.filename == file]
+    return f"{file}, line {lines[-1]}" if lines else ""
+
+
+def last_line(error: BaseException) -> str:
+    """Return where an error was raised, as "FILE, line 7"."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    return f"{last.filename}, line {last.lineno}"
 
 
 def _member(found: Any, path: str, what: str, *, of_learners: bool) -> Any:

@@ -10,7 +10,7 @@ import tempfile
 import xml.etree.ElementTree as ET
 from bisect import bisect_left
 from collections import defaultdict, deque
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, pairwise
@@ -32,7 +32,7 @@ from ugat_marl.scenarios.importers.count_sheet import (
 )
 from ugat_marl.scenarios.importers.long_files import lines
 from ugat_marl.scenarios.importers.making import ROUTES, VehicleFiles, VehicleSource
-from ugat_marl.scenarios.importers.streets import Streets
+from ugat_marl.scenarios.importers.streets import Streets, neighbours
 from ugat_marl.scenarios.importers.turning_shares import (
     CAR,
     MOST_VEHICLES,
@@ -467,12 +467,7 @@ def _not_drawn(rows: Iterable[Row], drives: Sequence[Drive], streets: Streets) -
 
     Random drives never turn back, and in a large network miss some turns by chance.
     """
-    onward: dict[str, list[str]] = defaultdict(list)
-    behind: dict[str, list[str]] = defaultdict(list)
-    for here, turns in streets.ahead.items():
-        for there in (road for turn, roads in turns.items() if turn != "t" for road in roads):
-            onward[here].append(there)
-            behind[there].append(here)
+    onward, behind = neighbours(streets.ahead)
     drawn = _passages(drives)
     for row in rows:
         if row.count and row.roads not in drawn:
@@ -484,20 +479,34 @@ def _not_drawn(rows: Iterable[Row], drives: Sequence[Drive], streets: Streets) -
 
 
 def _way(
-    neighbours: Mapping[str, Sequence[str]], start: str, goals: Collection[str]
+    following: Mapping[str, Iterable[str]], start: str, goals: Collection[str]
 ) -> tuple[str, ...]:
     """Return the fewest roads from one to any of `goals`, with both ends; empty without a way."""
-    way_to: dict[str, tuple[str, ...]] = {start: (start,)}
+    reached = _reached(start, lambda road: following.get(road, ()))
+    road = next((road for road in reached if road in goals), None)
+    way: list[str] = []
+    while road is not None:
+        way.append(road)
+        road = reached[road]
+    return tuple(way[::-1])
+
+
+def _reached(start: str, following: Callable[[str], Iterable[str]]) -> dict[str, str | None]:
+    """Return the roads that are reached from one, the nearest first, with the road before each.
+
+    Args:
+        start: The first road; there is none before it.
+        following: Function that returns the roads next to one.
+    """
+    reached: dict[str, str | None] = {start: None}
     waiting = deque([start])
     while waiting:
-        road = waiting.popleft()
-        if road in goals:
-            return way_to[road]
-        for following in neighbours.get(road, ()):
-            if following not in way_to:
-                way_to[following] = (*way_to[road], following)
-                waiting.append(following)
-    return ()
+        here = waiting.popleft()
+        for road in following(here):
+            if road not in reached:
+                reached[road] = here
+                waiting.append(road)
+    return reached
 
 
 def _require_reached(rows: Iterable[Row], drives: Sequence[Drive], path: Path) -> None:
@@ -891,12 +900,5 @@ def _route(trips: bytes, network: Path, out: Path, seed: int) -> None:
         write_whole(out, xml_bytes(root))
 
 
-def _reachable(streets: Streets, start: str) -> set[str]:
-    reached, waiting = {start}, deque([start])
-    while waiting:
-        for roads in streets.ahead.get(waiting.popleft(), {}).values():
-            for road in roads:
-                if road not in reached:
-                    reached.add(road)
-                    waiting.append(road)
-    return reached
+def _reachable(streets: Streets, start: str) -> Collection[str]:
+    return _reached(start, lambda road: chain(*streets.ahead.get(road, {}).values()))

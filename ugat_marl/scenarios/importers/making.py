@@ -99,7 +99,7 @@ class VehicleFiles:
 VehicleSource = Callable[[Path, Path, Reporter], VehicleFiles]
 """Function that puts route files into a folder (first path) for a network (second path)."""
 
-Draw = Callable[[Scenario, Path], object]
+Draw = Callable[[Scenario, Path, Reporter], object]
 """Function that draws the lights of a scenario, which may have no vehicles, into a folder."""
 
 
@@ -187,7 +187,7 @@ def make_scenario(
         made = Made(scenario, network, demand, notes, fleet.fits)
         write_whole(folder / "README.md", _readme(made, draft, command))
         if draw and (target / PICTURES).is_dir():
-            draw(scenario, folder / PICTURES)
+            draw(scenario, folder / PICTURES, reporter)
     return Made(read_scenario(target), network, demand, made.notes, made.fits)
 
 
@@ -230,7 +230,7 @@ def make_draft(
             network = Network.read(scenario)
             notes += network.notes
             turns = write_template(folder / COUNT_SHEET, document.parse())
-            draw(scenario, folder / PICTURES)
+            draw(scenario, folder / PICTURES, reporter)
         lines = _draft_readme(target, source, command, network, notes)
         write_whole(folder / "README.md", "\n".join(lines) + "\n")
     return Draft(network, target / COUNT_SHEET, turns, notes)

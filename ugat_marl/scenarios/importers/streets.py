@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from ugat_marl.scenarios.junctions import cars_may_use, lanes_without_cars, leads_cars
@@ -51,12 +51,7 @@ class Streets:
                 ahead[here][TURNS.get(letter, letter)][there] = None
         reached: set[str] = set()
         left: set[str] = set()
-        onward: dict[str, set[str]] = defaultdict(set)
-        behind: dict[str, set[str]] = defaultdict(set)
-        for here, turns in ahead.items():
-            for there in (road for turn, roads in turns.items() if turn != "t" for road in roads):
-                onward[here].add(there)
-                behind[there].add(here)
+        onward, behind = neighbours(ahead)
         for here, turns in ahead.items():
             # At its edge SUMO lets vehicles turn back, into a street that may be in pieces.
             at_edge = set(turns) == {"t"}
@@ -76,6 +71,23 @@ class Streets:
             tuple(road for road in start if road not in reached and road in left),
             frozenset(road for road in start if road not in left),
         )
+
+
+def neighbours(
+    ahead: Mapping[str, Mapping[str, Iterable[str]]],
+) -> tuple[dict[str, dict[str, None]], dict[str, dict[str, None]]]:
+    """Return the roads ahead of and behind every road but for U-turns, as keys in their order.
+
+    Args:
+        ahead: Road to the roads ahead, by turn, as in `Streets`.
+    """
+    onward: dict[str, dict[str, None]] = defaultdict(dict)
+    behind: dict[str, dict[str, None]] = defaultdict(dict)
+    for here, turns in ahead.items():
+        for there in (road for turn, roads in turns.items() if turn != "t" for road in roads):
+            onward[here][there] = None
+            behind[there][here] = None
+    return onward, behind
 
 
 def _in_line(road: str, neighbours: Mapping[str, Collection[str]]) -> list[str]:
