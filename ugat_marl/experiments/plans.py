@@ -210,7 +210,7 @@ def _grounded_work(
         work["fitting"] = (worlds if times else 0, short)
         work["fitted street"] = (times * ugat.grounded_episodes, 1.0)
         candidates = 2 + len(street.late_s) + 2 * bool(rule_budget)  # with lessons, and the rule
-        work["comparing"] = (candidates * street.judged * times, 1.0)
+        work["comparing"] = (candidates * street.judged * times, 0.5)  # most leave early
         if street.late_s:
             work["under delays"] = (times * ROLL_OUTS, 1.0)
             work["late greens"] = (len(street.late_s) * times * ugat.grounded_episodes, 1.0)

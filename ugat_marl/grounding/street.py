@@ -108,8 +108,8 @@ class StreetConfig:
         simulated_s: Length of an episode in such a world, in s, at least `LEAST_DECISIONS`. Of
             longer episodes of the street only this first part is compared. Detectors are compared
             over whole episodes.
-        judged: Worlds of the fitted street in which policies are compared after each iteration; the
-            best one is kept. 0 keeps the last one.
+        judged: Most worlds of the fitted street in which policies race after each iteration
+            (`policy_race.race_policies`); the best one is kept. 0 keeps the last one.
         rule_budget: Budget that decides how many settings of each rule race in worlds of the fitted
             street. The best rule of all teaches the learner, and is kept if it is better than the
             trained policies. With 0 only trained policies are kept. None stands for 6 with a
@@ -127,7 +127,7 @@ class StreetConfig:
     simulations: int = 160
     further: int = 40
     simulated_s: float = 1800.0
-    judged: int = 8
+    judged: int = 40
     rule_budget: int | None = None
     rival: Literal["none", "matched", "several"] = "several"
     without: tuple[str, ...] = ()

@@ -29,12 +29,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ugat_marl.data import TransitionLog
 from ugat_marl.effects import late_greens
 from ugat_marl.envs import as_traffic_env
 from ugat_marl.grounding.algorithm import Algorithm, iteration_name
 from ugat_marl.grounding.fitting import Fitter
 from ugat_marl.grounding.oversaturation import Oversaturation
+from ugat_marl.grounding.policy_race import race_policies
 from ugat_marl.grounding.posterior import WorldPrior
 from ugat_marl.grounding.residual import Residual
 from ugat_marl.grounding.rival import ROLL_OUTS, Rival, judged_as, late_world, matched_delays
@@ -274,8 +278,8 @@ class StreetTraining(Algorithm):
         Returns:
             Average travel times in s, for the metrics.
         """
-        count = self.config.street.judged
-        if count == 0:
+        most = self.config.street.judged
+        if most == 0:
             return {}
         kept = state.best or state.direct
         assert kept is not None  # plain training comes first
@@ -287,22 +291,27 @@ class StreetTraining(Algorithm):
             "of_the_rule": rule,
         }
         policies = {name: policy for name, policy in known.items() if policy is not None}
-        seeds = [derive_seed(self.seed, "judged", state.iteration, k) for k in range(count)]
-        worlds = [street.world(seed) for seed in seeds]
         title = f"comparing, {iteration_name(state)}"
-        with self.run.reporter.task(title, len(policies) * count) as advance:
-            compared = self.simulation.compare(worlds, [*policies.values()], seeds, advance)
-        times_s = dict(zip(policies, compared.mean(1).tolist(), strict=True))
-        best = min(times_s, key=lambda name: times_s[name])  # of equal ones the one kept so far
-        state.best = policies[best]
-        told = ", ".join(f"{JUDGED[name]} {time_s:.1f} s" for name, time_s in times_s.items())
-        named = JUDGED[best]
-        if rule is not None and policies[best] is rule:
+        with self.run.reporter.task(title, len(policies) * most) as advance:
+
+            def play(running: Sequence[str], numbers: range) -> NDArray[np.float64]:
+                seeds = [derive_seed(self.seed, "judged", state.iteration, k) for k in numbers]
+                worlds = [street.world(seed) for seed in seeds]
+                playing = [policies[name] for name in running]
+                return self.simulation.compare(worlds, playing, seeds, advance)
+
+            race = race_policies(list(policies), most, play)
+        state.best = policies[race.best]
+        told = ", ".join(f"{JUDGED[name]} {time_s:.1f} s" for name, time_s in race.times_s.items())
+        named = JUDGED[race.best]
+        if rule is not None and policies[race.best] is rule:
             named += f" {rule.spec}"
         self.run.reporter.say(
-            f"{iteration_name(state)}: travel time in the fitted street: {told}; {named} is kept"
+            f"{iteration_name(state)}: travel time in {race.worlds} worlds of the fitted street: "
+            f"{told}; {named} is kept"
         )
-        return {f"judged/{name}": time_s for name, time_s in times_s.items()}
+        judged = {f"judged/{name}": time_s for name, time_s in race.times_s.items()}
+        return {**judged, "judged_worlds": race.worlds}
 
     def renew(self, state: RunState[StreetFit]) -> None:
         """Replace the learner of a restored run, if policies see something else in the street."""

@@ -1,0 +1,90 @@
+"""Race of policies in worlds of a fitted street: a policy that is clearly slower leaves it.
+
+All policies play in the same worlds. After each round a paired test compares them with the best one
+(Maron and Moore, *Hoeffding races*, 1994; the t test in place of Hoeffding's bound).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+ROUND = 8
+"""Worlds of a round."""
+
+CHANCE = 0.01
+"""Chance that a policy which is as good as the best one leaves after a round."""
+
+LEVEL = 0.005
+"""Share of the travel time for which no further round is played."""
+
+
+@dataclass(frozen=True)
+class PolicyRace:
+    """Outcome of a race.
+
+    Attributes:
+        best: Name of the best policy.
+        times_s: Travel times in s by name. That of a policy which left is the time of the best one
+            plus their mean difference in the worlds in which both played.
+        worlds: Worlds in which the best policy played.
+    """
+
+    best: str
+    times_s: dict[str, float]
+    worlds: int
+
+
+def race_policies(
+    names: Sequence[str],
+    most: int,
+    play: Callable[[Sequence[str], range], NDArray[np.float64]],
+) -> PolicyRace:
+    """Compare policies in more and more worlds, until no other one may be better than the best.
+
+    Args:
+        names: Policies that take part; of equal ones the first is the best.
+        most: Most worlds in which a policy plays, at least 1.
+        play: Called with the policies of a round and the numbers of its worlds; returns travel
+            times in s, ``(policies, worlds)``.
+    """
+    played_s = {name: np.empty(0) for name in names}
+    best, running, done = names[0], list(names), 0
+    while not done or (done < most and len(running) > 1):
+        worlds = range(done, min(done + ROUND, most))
+        for name, times_s in zip(running, play(tuple(running), worlds), strict=True):
+            played_s[name] = np.append(played_s[name], times_s)
+        done = worlds.stop
+        best = min(running, key=lambda name: played_s[name].mean())
+        if done > 1:
+            running = _running(played_s, running, best)
+    mean_s = played_s[best].mean()
+    times_s = {name: mean_s + _behind_s(played_s, name, best).mean() for name in names}
+    return PolicyRace(best, {name: float(time_s) for name, time_s in times_s.items()}, done)
+
+
+def _running(
+    played_s: Mapping[str, NDArray[np.float64]], running: Sequence[str], best: str
+) -> list[str]:
+    """Return the policies of the next round; the best one alone if no other is worth it."""
+    behind_s = {name: _behind_s(played_s, name, best) for name in running}
+    worlds = len(played_s[best])
+    limit = stdtrit(worlds - 1, 1 - CHANCE) / np.sqrt(worlds)
+    near = {
+        name: late_s
+        for name, late_s in behind_s.items()
+        if late_s.mean() <= limit * late_s.std(ddof=1)
+    }
+    gain_s = max(limit * late_s.std(ddof=1) - late_s.mean() for late_s in near.values())
+    return list(near) if gain_s > LEVEL * played_s[best].mean() else [best]
+
+
+def _behind_s(
+    played_s: Mapping[str, NDArray[np.float64]], name: str, best: str
+) -> NDArray[np.float64]:
+    """Return by how much a policy is slower than the best one where both played, in s."""
+    return played_s[name] - played_s[best][: len(played_s[name])]
