@@ -372,6 +372,7 @@ def test_a_budget_too_small_for_anything_says_so(
     assert "Partial result: the budget of 0.01 s (--budget-s) ended" in text
     assert "held-out periods" not in text
     assert "Partial result" in (tmp_path / "out" / "report.html").read_text()
+    assert "There is no corrected scenario: no effect was found to correct it by." in text
 
 
 def count_seconds(monkeypatch: pytest.MonkeyPatch) -> None:

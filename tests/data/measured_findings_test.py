@@ -318,6 +318,8 @@ def test_a_few_rows_outside_of_their_period_are_left_out(read: Read) -> None:
         (5 * 3600.0, "seems to be 5 hours late: is it in another time zone, such as UTC"),
         (-3 * 3600.0, "seems to be 3 hours early"),
         (20 * 3600.0, "or is the period too short"),
+        (-24 * 3600.0, "seems to be 1 day early: is the date of the period's zero right"),
+        (7 * 24 * 3600.0, "seems to be 7 days late"),
     ],
 )
 def test_a_log_on_another_clock_is_refused_with_a_guess(

@@ -34,7 +34,7 @@ from ugat_marl.reporting import (
     write_diagnosis_page,
 )
 from ugat_marl.reporting import diagnosis_words as words
-from ugat_marl.reporting.diagnosis_page import _usual_commands, diagnosis_page
+from ugat_marl.reporting.diagnosis_page import _criteria, _usual_commands, diagnosis_page
 from ugat_marl.scenarios import Network
 
 LANES = ("S_C_0", "W_C_0", "C_N_0", "C_E_0")
@@ -378,6 +378,15 @@ def test_the_usual_command_is_the_same_run() -> None:
         (options("unknown", traffic_check=None), False),
     ):
         assert ("--correct-anyway" in one) == anyway
+
+
+def test_criteria_of_a_correction_that_is_not_there_are_left_out() -> None:
+    explained = diagnosis_of("explained")
+    for diagnosis, there in ((explained, True), (replace(explained, best=None), False)):
+        table = _criteria(diagnosis)
+        assert table is not None
+        assert any(row[-1] != "–" for row in table.rows) is there
+        assert any(row[-2] != "–" for row in table.rows)
 
 
 def test_nothing_held_out_is_said(network: Network) -> None:

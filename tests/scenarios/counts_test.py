@@ -540,6 +540,18 @@ def test_counts_that_are_spread_over_an_odd_time_are_told(
     assert "whole episode" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("road", [False, True])
+def test_turns_without_a_count_are_counted(
+    road: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A filter in the spreadsheet may have dropped them; counts of roads alone have none."""
+    rows = "edge,count\nwest1_A1,60\n" if road else "from,to,count\nwest1_A1,A1_B1,60\n"
+    (tmp_path / "t.csv").write_text(rows)
+    assert made(tmp_path / "city", "--counts", tmp_path / "t.csv", "--duration-s", "600") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert ("23 of 24 turns at lights have no count in t.csv" in said) is not road
+
+
 def test_columns_that_are_not_read_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -179,6 +179,8 @@ class Diagnose:
             lines.append(f"use it:    {following[0]}")
         elif diagnosis.effects and not any(map(_in_the_model, diagnosis.effects)):
             lines.append("The effects are faults of detectors; the simulation stays as it is.")
+        elif not diagnosis.effects and diagnosis.verdict != "no_discrepancy":
+            lines.append("There is no corrected scenario: no effect was found to correct it by.")
         if diagnosis.not_corrected is not None:
             lines.append(f"{diagnosis.not_corrected} --correct-anyway does it all the same.")
         console.print("\n" + "\n".join(lines), soft_wrap=True)

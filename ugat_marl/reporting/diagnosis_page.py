@@ -348,6 +348,8 @@ def _criteria(diagnosis: Diagnosis) -> Grid | None:
     if (times := diagnosis.travel_time) is not None:
         rows.append(("mean travel time (s)", "", number(times.before_s), number(times.after_s)))
     columns = ("measured", "before", "after")
+    if diagnosis.best is None:  # the scenario as it is stands on both sides
+        rows = [(*row[:-1], "–") for row in rows]
     return Grid(("criterion", *columns), rows, columns)
 
 

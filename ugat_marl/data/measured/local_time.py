@@ -210,6 +210,7 @@ def _times(path: Path, cells: pl.Series, time_zone: str, start: int, mapping: st
 
 def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
     empty = cells.is_null() | (cells == "")
+    cells = cells.str.replace(r"(:\d\d),(\d)", "$1.$2")
     offset = cells.str.contains(_OFFSET)
     if offset.any():
         whole = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,10 +40,10 @@ FEW_ROWS = 10
 """With fewer rows, a clock set back looks the same as rows out of order."""
 MOST_OUTSIDE = 0.5
 """Largest share of a period's rows that may lie outside of the period."""
-HOUR_S = 3600.0
-"""Step of a clock at the begin and end of daylight saving."""
+HOUR_S, DAY_S = 3600.0, 86400.0
+"""Step of a clock at the begin and end of daylight saving, and what a wrong date shifts, in s."""
 QUARTER_S, MOST_HOURS = 900.0, 14
-"""Difference from whole hours, in s, and most hours, at which a log seems to be in another zone."""
+"""Difference from whole hours or days, in s, at which a log seems shifted, and most hours."""
 EPOCH = 1e8
 """Times above this are dates, not seconds of a scenario."""
 
@@ -467,9 +468,12 @@ def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
     if wrong.any():
         at = int(wrong.arg_true()[0])
         text = str(cells[at])
-        comma = " with a point, not a comma" if "," in text else ""
+        wanted = "a number with a point, not a comma" if "," in text else "a number"
+        if clock := re.fullmatch(r"(\d{1,2}):(\d\d)(?::(\d\d))?", text, re.ASCII):
+            hours, minutes, seconds = (int(part or 0) for part in clock.groups())
+            wanted = f"seconds, {3600 * hours + 60 * minutes + seconds} for this time of day"
         raise MeasuredDataError(
-            f"{place(path, at + start)}: {name} is {text[:40]!r}; write a number{comma}, or "
+            f"{place(path, at + start)}: {name} is {text[:40]!r}; write {wanted}, or "
             "leave the row out"
         )
     return numbers.fill_nan(None)
@@ -612,11 +616,16 @@ def report_outside(
             example = time[own & ~inside][0]
             if abs(example) > EPOCH:
                 hint = "these are dates; subtract the moment at which the scenario's clock is 0"
-            elif hours := _hours_off(time[own], period):
+            elif 0 < abs(hours := _off(time[own], period, HOUR_S)) <= MOST_HOURS:
                 hint = (
                     f"the log seems to be {counted(abs(hours), 'hour')} "
                     f"{'early' if hours < 0 else 'late'}: is it in another time zone, such as UTC, "
                     "or was daylight saving forgotten?"
+                )
+            elif days := _off(time[own], period, DAY_S):
+                hint = (
+                    f"the log seems to be {counted(abs(days), 'day')} "
+                    f"{'early' if days < 0 else 'late'}: is the date of the period's zero right?"
                 )
             else:
                 hint = (
@@ -646,12 +655,11 @@ def _reaches_through(
     )
 
 
-def _hours_off(time_s: NDArray[np.float64], period: Period) -> int:
-    """Return the whole hours by which a log as long as its period is late; 0 for none."""
+def _off(time_s: NDArray[np.float64], period: Period, unit_s: float) -> int:
+    """Return by how many whole units a log as long as its period is late; 0 for none."""
     off_s = (time_s.min() + time_s.max() - period.begin_s - period.end_s) / 2
-    hours = round(off_s / HOUR_S)
-    like = abs(off_s - hours * HOUR_S) <= QUARTER_S and abs(hours) <= MOST_HOURS
-    return hours if like else 0
+    units = round(off_s / unit_s)
+    return units if abs(off_s - units * unit_s) <= QUARTER_S else 0
 
 
 def in_order(

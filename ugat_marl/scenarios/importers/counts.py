@@ -369,6 +369,7 @@ def from_counts(path: Path, begin_s: float, length_s: float, seed: int) -> Vehic
         write_whole(folder / COUNT_SHEET, b"".join(chunks_of(path)))
         notes = (
             _summary(fits, path),
+            *_about_uncounted(rows, names, path),
             *_on_the_way(rows, sampled, root),
             *_about_ends(given, rows),
             *_about_times(rows, filling, path, begin_s, end_s),
@@ -732,6 +733,18 @@ def _summary(fits: Sequence[CountFit], path: Path) -> str:
         f"{good} of {len(fits)} counts of {path.name} are met within a GEH of {GOOD_GEH:g}; "
         f"{FIT_SHEET} has them one by one"
     )
+
+
+def _about_uncounted(rows: Iterable[Row], names: NamedNetwork, path: Path) -> list[str]:
+    """Tell how many turns at lights have no count, where others have one."""
+    turns = {(turn.from_edge, turn.to_edge) for turn in names.choices()}
+    missing = turns - {pair for row in rows for pair in pairwise(row.roads)}
+    if not missing or missing == turns:
+        return []
+    return [
+        f"{len(missing)} of {len(turns)} turns at lights have no count in {path.name}; how many "
+        "vehicles turn there is left to chance"
+    ]
 
 
 _LATE = 0.1
