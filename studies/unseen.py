@@ -122,6 +122,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         help="degree of saturation of the busiest intersection",
     )
     parser.add_argument("--simulations", type=int, default=StreetConfig.simulations)
+    parser.add_argument(
+        "--evaluation-seeds", type=int, default=10, help="episodes of each row in each domain"
+    )
     parser.add_argument("--rule-budget", type=int, default=6)
     parser.add_argument(
         "--street-rules", type=int, help="episodes of each rule in the fitted street; 0 for none"
@@ -131,7 +134,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--jobs", type=int)
     given = parser.parse_args(arguments)
     require_least(0 if given.pbf else 1, networks=given.networks)
-    require_least(1, extracts=given.extracts, seeds=given.seeds)
+    require_least(
+        1, extracts=given.extracts, seeds=given.seeds, evaluation_seeds=given.evaluation_seeds
+    )
     config = PaperConfig(
         domains=tuple(given.domains),
         seeds=given.seeds,
@@ -141,7 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         groundings=("street",),
         constants=CONSTANTS,
         rows=ROWS,
-        evaluation_seeds=3,
+        evaluation_seeds=given.evaluation_seeds,
         rule_budget=given.rule_budget,
         street=StreetConfig(
             simulations=given.simulations, rule_budget=given.street_rules, rival=given.rival
