@@ -17,6 +17,7 @@ from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import ALL_FEATURES, BIN_FEATURES, FEATURES, INDEX, Tally
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.traffic import _levelled, approach_table, traffic_check
+from ugat_marl.diagnosis.verify import judged
 from ugat_marl.diagnosis.workflow import _reason_against as reason_against
 from ugat_marl.diagnosis.workflow import _without_search as without_search
 from ugat_marl.effects import (
@@ -27,6 +28,7 @@ from ugat_marl.effects import (
     Headway,
     LaneService,
     Undercount,
+    parse_domain,
 )
 
 THRESHOLDS = Thresholds()
@@ -132,6 +134,34 @@ def test_without_travel_times_counts_decide() -> None:
         without_journeys(street), without_journeys(sim), without_journeys(right), THRESHOLDS
     )
     assert check is not None and check.better
+
+
+@pytest.mark.parametrize(
+    ("domain", "given", "measure"),
+    [
+        ("demand_level=*,1.5", True, "service counts"),
+        ("demand_level=*,1.5+undercount=*,0.1", True, "service counts"),
+        ("demand_level=*,1.5+headway=1.4", True, "travel time and queue"),
+        ("demand_level=*,1.5", False, "travel time and queue"),
+    ],
+)
+def test_counts_judge_demand_where_arrivals_are_given(
+    domain: str, given: bool, measure: str
+) -> None:
+    """Effects of demand leave such days as they are, but for their counts."""
+    study: Any = SimpleNamespace(
+        config=SimpleNamespace(thresholds=THRESHOLDS),
+        heldout=days(1, 2, 25, 5, served=30),
+        other_days="simulator" if given else None,
+    )
+
+    def model(served: float, effects: Sequence[Effect] = ()) -> Any:
+        known = dict(enumerate(days(2, 16, 25, 5, served=served)))
+        return SimpleNamespace(model=SimpleNamespace(days=known, effects=effects))
+
+    check = judged(study, model(20), model(30, parse_domain(domain)))
+    assert check is not None and check.measure == measure
+    assert check.better == (measure == "service counts")
 
 
 @pytest.mark.parametrize(("kind", "measure"), [("advance", "counts upstream"), ("", None)])

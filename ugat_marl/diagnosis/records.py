@@ -562,7 +562,8 @@ class TrafficCheck:
     Attributes:
         measure: The measures: ``travel time and queue``, else ``travel times of probes``, else
             ``speed and occupancy`` of intervals, else ``service counts`` at stop and exit
-            detectors, else ``counts upstream``.
+            detectors, else ``counts upstream``. If measured arrivals are given and all effects are
+            of demand, counts alone.
         error_before: Sum of the relative errors of the scenario as it is.
         error_after: Sum of the relative errors of the corrected model.
         noise: Standard error of their difference.

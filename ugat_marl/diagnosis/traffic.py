@@ -94,6 +94,8 @@ def traffic_check(
     before: Sequence[Tally],
     after: Sequence[Tally],
     thresholds: Thresholds,
+    *,
+    counts_alone: bool = False,
 ) -> TrafficCheck | None:
     """Judge a correction on held-out periods.
 
@@ -109,12 +111,14 @@ def traffic_check(
         before: Tallies of days of the scenario as it is.
         after: Tallies of days of the corrected model.
         thresholds: Numbers of the method.
+        counts_alone: Judge by counts, since the correction changes nothing else of simulated days.
 
     Returns:
         None if the data hold nothing to judge by.
     """
     stretches = [day.window for day in after]
-    for measure, (sums, vehicles) in _MEASURES.items():
+    measures = _COUNTS if counts_alone else _OF_VEHICLES | _COUNTS
+    for measure, (sums, vehicles) in measures.items():
         sides = [sums(days) for days in (measured, before, after)]
         if all(side is not None and side.shape[-2] for side in sides):
             real, old, new = (side for side in sides if side is not None)
@@ -233,10 +237,12 @@ def _counted(real: Array) -> float:
     return float(real[..., 0].sum())
 
 
-_MEASURES = {
+_OF_VEHICLES = {
     "travel time and queue": (_journeys, _observed_first),
     "travel times of probes": (_timed, _most_observed),
     "speed and occupancy": (_passing, _most_observed),
+}
+_COUNTS = {
     "service counts": (_counts_of(SERVICE_COUNTS), _counted),
     "counts upstream": (_counts_of(COUNT_FEATURES[:1]), _counted),
 }

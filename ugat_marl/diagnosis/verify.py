@@ -99,11 +99,21 @@ def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
 
 
 def judged(study: Study, base: Tested, best: Tested) -> TrafficCheck | None:
-    """Judge the correction on the held-out periods; None if it changes no traffic."""
-    if all(effect.on_detectors for effect in best.model.effects):
+    """Judge the correction on the held-out periods; None if it changes no traffic.
+
+    Days with measured arrivals show effects on departures in their counts alone. So counts decide
+    if there are no other effects; beside others, effects on departures are not judged.
+    """
+    of_traffic = [effect for effect in best.model.effects if not effect.on_detectors]
+    if not of_traffic:
         return None
-    days = _same_days(study, base, best)
-    return traffic_check(study.heldout, *days, study.config.thresholds)
+    arrivals_given = study.other_days is not None
+    return traffic_check(
+        study.heldout,
+        *_same_days(study, base, best),
+        study.config.thresholds,
+        counts_alone=arrivals_given and all(effect.on_departures for effect in of_traffic),
+    )
 
 
 def _same_days(study: Study, base: Tested, best: Tested) -> tuple[list[Tally], list[Tally]]:
