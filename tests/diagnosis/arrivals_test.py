@@ -27,10 +27,12 @@ from ugat_marl.diagnosis.engine import Budget, Engine
 from ugat_marl.diagnosis.features import BIN_FEATURES, FEATURES, INDEX, DetectorLayout, tally
 from ugat_marl.diagnosis.replay import Replay
 from ugat_marl.diagnosis.statistics import Pools
+from ugat_marl.diagnosis.supplementary_data import TURNING
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.unmeasured import Unmeasured
 from ugat_marl.effects import Effect, depart_s, load_scenario, parse_domain
 from ugat_marl.experiments import policy_factory, record
+from ugat_marl.files import xml_bytes
 from ugat_marl.scenarios import Network, Passages, Period, Scenario, draw_day
 from ugat_marl.simulation import standard_detectors
 
@@ -257,6 +259,57 @@ def test_effects_on_demand_cost_no_simulation(
         np.testing.assert_array_equal(found.tally.sums[INDEX[name]], plain.tally.sums[INDEX[name]])
 
 
+def test_approaches_without_advance_detectors_keep_the_vehicles_asked_for(
+    crossing: tuple[Scenario, Network, DetectorLayout],
+) -> None:
+    scenario, network, layout = crossing
+    few = [one for one in layout.detectors if one.id != "advance:W_C_0"]
+    layout = DetectorLayout.of(network, few)
+    times = np.linspace(20.0, 180.0, 8).tolist()
+    log = tuple((30.0 * turn, ("Gr", "rG")[turn % 2]) for turn in range(6))
+    period = dataclasses.replace(
+        a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times})), signals={"C": log}
+    )
+    replay = Replay(scenario, network, few, layout.owner, THRESHOLDS, answering=True)
+    engine = Engine(
+        scenario, layout, replay, [period], 5, THRESHOLDS,
+        budget=(budget := Budget()), unmeasured=Unmeasured.of([period]),
+    )  # fmt: skip
+    place = [lane.id for lane in layout.lanes].index("W_C_0")
+    own, west, south = (
+        engine.replicates(parse_domain(text), [0])[0]
+        for text in ("sim", "demand_level=W_C,3", "demand_level=S_C,3")
+    )
+    assert budget.spent_h == pytest.approx(2 * period.length_s / 3600.0), "not the south"
+    queued = [day.tally.sums[INDEX["discharged"], place, 0] for day in (own, west, south)]
+    assert queued[1] > 1.5 * queued[0] > 0.0
+    assert queued[2] == queued[0]
+    assert west.due is not None and own.due is not None
+    np.testing.assert_array_equal(west.due.given["W_C"], west.due.asked["W_C"])
+    np.testing.assert_array_equal(west.due.given["S_C"], own.due.given["S_C"])
+
+
+def test_who_stops_on_the_way_takes_an_arrival(
+    crossing: tuple[Scenario, Network, DetectorLayout],
+) -> None:
+    scenario, network, layout = crossing
+    day = draw_day(scenario, 3)
+    document = day.routes[0]
+    root = document.parse()
+    south = [x for x in root.iter("vehicle") if x.find("route[@edges='S_C C_N']") is not None]
+    ET.SubElement(south[2], "stop", lane="S_C_0", endPos="50", duration="5")
+    changed = dataclasses.replace(document, content=xml_bytes(root))
+    day = dataclasses.replace(day, routes=(changed, *day.routes[1:]))
+    position = {item.id: item.position_m for item in layout.detectors}["advance:S_C_0"]
+    way = position / network.lanes["S_C_0"].speed_mps
+    own = depart_s(south[2])
+    times = [own + way + later for later in (-6.0, 1.0, 60.0)]
+    period = a_period(passages({"advance:S_C_0": times, "stop:S_C_0": times}))
+    found, due, _ = Arrivals(layout, network, THRESHOLDS).given(day, day, period)
+    assert departs(found)["S_C"] == pytest.approx([own - 6.0, own, own + 60.0], abs=0.006)
+    assert due.given["S_C"].sum() == 3
+
+
 def test_detectors_that_missed_vehicles_do_not_keep_them_away(
     crossing: tuple[Scenario, Network, DetectorLayout],
 ) -> None:
@@ -284,6 +337,41 @@ def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, DetectorL
     assert found.sums[INDEX["count_stop"], place].tolist() == pytest.approx([9.6, 10.0])
     assert found.bins[BIN_FEATURES.index("count_stop"), place].tolist() == pytest.approx([9.2, 0.4])
     assert not found.sums[INDEX["platoon_gap"]].any()
+
+
+def test_turning_counts_are_those_asked_for(
+    crossing: tuple[Scenario, Network, DetectorLayout],
+) -> None:
+    """They were counted in a quarter of the period."""
+    _, _, layout = crossing
+    sums = np.zeros((len(FEATURES), len(layout.places), 2))
+    turning = np.array([[[4.0, 5.0]], [[2.0, 5.0]]])
+    day = Tally(
+        sums,
+        np.zeros((len(BIN_FEATURES), len(layout.places), 2)),
+        supplementary={TURNING: turning},
+        window=(0.0, 1200.0),
+    )
+    edges = {edge: np.zeros(2) for _, edge, _ in layout.places}
+    asked = edges | {"S_C C_N": np.array([12.0, 16.0]), "W_C C_E": np.array([1.0, 0.0])}
+    given = edges | {"S_C C_N": np.array([10.0, 10.0]), "W_C C_E": np.array([9.0, 9.0])}
+    turns = (("S_C", "C_N"), ("W_C", "C_E"))
+    found = corrected(day, layout, DemandBalance(asked, given), turns)
+    assert found.supplementary[TURNING].tolist() == [[[4.0 + 8.0 / 4, 5.0]], [[0.0, 5.0]]]
+    assert day.supplementary[TURNING] is turning and turning[0, 0, 0] == 4.0
+
+
+def test_who_turns_is_asked_for_by_his_way(
+    crossing: tuple[Scenario, Network, DetectorLayout],
+) -> None:
+    scenario, network, layout = crossing
+    day = draw_day(scenario, 3)
+    turns = [("S_C", "C_N"), ("W_C", "C_N")]
+    _, due, _ = Arrivals(layout, network, THRESHOLDS, turns).given(day, day, a_period({}))
+    np.testing.assert_array_equal(due.asked["S_C C_N"], due.asked["S_C"])
+    assert due.asked["S_C C_N"].sum() > 0
+    assert not due.given["S_C C_N"].any()
+    assert not due.asked["W_C C_N"].any()
 
 
 def test_of_vehicles_between_two_lights_both_count_all() -> None:

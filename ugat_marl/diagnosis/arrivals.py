@@ -30,6 +30,7 @@ from ugat_marl.diagnosis.features import (
     bins_in,
 )
 from ugat_marl.diagnosis.journeys import Crossings, matched
+from ugat_marl.diagnosis.supplementary_data import TURNING
 from ugat_marl.diagnosis.thresholds import DayThresholds
 from ugat_marl.effects import (
     depart_s,
@@ -43,6 +44,9 @@ from ugat_marl.scenarios import (
     Period,
     Scenario,
 )
+
+_Came = tuple[float, frozenset[str]]
+"""Time of a measured arrival, s, and its possible next edges."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +77,8 @@ class DemandBalance:
     """Vehicles that the model's demand asks for, and vehicles that the simulated day got.
 
     Attributes:
-        asked: Vehicles of the demand that would reach the end of an edge in free flow, by edge,
-            ``(bins,)``.
+        asked: Vehicles of the demand that would reach the end of an edge in free flow, ``(bins,)``,
+            by edge, and by edge and next edge with a space between.
         given: The same numbers for the vehicles that were simulated.
     """
 
@@ -89,15 +93,22 @@ class Arrivals:
         layout: Lanes and detectors.
         network: The network.
         thresholds: Numbers of the method.
+        turns: Pairs of edges whose turning vehicles are counted.
     """
 
-    def __init__(self, layout: DetectorLayout, network: Network, thresholds: DayThresholds) -> None:
+    def __init__(
+        self,
+        layout: DetectorLayout,
+        network: Network,
+        thresholds: DayThresholds,
+        turns: Iterable[tuple[str, str]] = (),
+    ) -> None:
         self._thresholds = thresholds
         lanes = network.lanes.values()
         self._pace_s = {lane.edge: lane.length_m / lane.speed_mps for lane in lanes}
         self._ways: dict[str, _Way] = {}
         self._approaches = _approaches(layout, thresholds)
-        self._counted = frozenset(edge for _, edge, _ in layout.places)
+        self._counted = {edge for _, edge, _ in layout.places} | set(map(" ".join, turns))
 
     def given(
         self, asked: Scenario, drivers: Scenario, period: Period
@@ -106,31 +117,38 @@ class Arrivals:
 
         Args:
             asked: The day of the model, with all its effects.
-            drivers: The same day without effects on departures. Its vehicles are simulated, so
-                effects on departures do not change the simulation.
+            drivers: The same day without effects on departures. Its vehicles are simulated where
+                arrivals are measured, so effects on departures do not change the simulation there.
             period: The measured period.
 
         Returns:
             The day to simulate, the vehicles that were asked for and given, and the earliest
             departure to a measured arrival, s; inf if there is none. Some vehicles stay as they
-            are: those without an approach with advance detectors, those with a stop on their way,
-            and those that arrive before the period.
+            are: those without an approach with advance detectors, which are those asked for, those
+            with a stop on their way, which take the nearest measured arrivals, and those that
+            arrive before the period.
         """
         document = drivers.routes[0]
         root = document.parse()
         demand = root if asked is drivers else asked.routes[0].parse()
         due = self._by_edge(demand, period)
         pools: dict[str, list[_Coming]] = {edge: [] for edge in self._approaches}
-        stay: list[ET.Element] = []
+        stopping: dict[str, list[_Coming]] = {edge: [] for edge in self._approaches}
+        stay = [element for element in demand if self._unmeasured(element)]
         for element in root:
+            if self._unmeasured(element):
+                continue
             coming = self._coming(element, period) if element.tag == "vehicle" else None
             if coming is None:
                 stay.append(element)
+            elif element.find("stop") is not None:
+                stay.append(element)
+                stopping[coming.approach].append(coming)
             else:
                 pools[coming.approach].append(coming)
         filled: list[ET.Element] = []
         for edge, pool in pools.items():
-            came = self._came(edge, period)
+            came = _left_by(stopping[edge], self._came(edge, period), period)
             filled += _filled(pool, came, drivers.settings.begin_s, self._thresholds)
         root[:] = [*stay, *filled]
         sort_departures(root)
@@ -141,14 +159,35 @@ class Arrivals:
             min(map(depart_s, filled), default=math.inf),
         )
 
-    def asked(self, day: Scenario, period: Period) -> dict[str, Array]:
-        """Return vehicles of a day that would reach the end of each counted edge, ``(bins,)``."""
-        return self._by_edge(day.routes[0].parse(), period)
+    def asked(self, day: Scenario, drivers: Scenario, period: Period) -> dict[str, Array] | None:
+        """Return `DemandBalance.asked` of a day.
+
+        Args:
+            day: The day of the model, with all its effects.
+            drivers: The same day without effects on departures.
+            period: The measured period.
+
+        Returns:
+            None if effects on departures change vehicles that `given` takes from the demand.
+        """
+        demand, others = (one.routes[0].parse() for one in (day, drivers))
+        here, there = (
+            [(one.get("id"), depart_s(one)) for one in root if self._unmeasured(one)]
+            for root in (demand, others)
+        )
+        return self._by_edge(demand, period) if here == there else None
+
+    def _unmeasured(self, element: ET.Element) -> bool:
+        """Return True for a vehicle that is counted, but on no approach with advance detectors."""
+        if element.tag != "vehicle":
+            return False
+        way = self._way(_route(element))
+        return way.approach is None and bool(way.counted)
 
     def _coming(self, element: ET.Element, period: Period) -> _Coming | None:
-        """Return where and when a vehicle is first detected; None if it must stay as it is."""
+        """Return where and when a vehicle is first detected; None if nowhere, or before then."""
         way = self._way(_route(element))
-        if way.approach is None or element.find("stop") is not None:
+        if way.approach is None:
             return None
         way_s = way.approach_s / _factor(element)
         time = depart_s(element) + way_s
@@ -164,7 +203,10 @@ class Arrivals:
         edges = route.split()
         ends = np.cumsum([0.0, *(self._pace_s[edge] for edge in edges)]).tolist()
         counted = tuple(
-            (edge, end) for edge, end in zip(edges, ends[1:], strict=True) if edge in self._counted
+            (place, end)
+            for edge, following, end in zip(edges, [*edges[1:], ""], ends[1:], strict=True)
+            for place in (edge, f"{edge} {following}")
+            if place in self._counted
         )
         way = _Way(counted)
         first = next((i for i, edge in enumerate(edges) if edge in self._approaches), None)
@@ -176,7 +218,7 @@ class Arrivals:
         self._ways[route] = way
         return way
 
-    def _came(self, edge: str, period: Period) -> list[tuple[float, frozenset[str]]]:
+    def _came(self, edge: str, period: Period) -> list[_Came]:
         """Return the arrival times at an approach, s, each with its possible next edges."""
         lanes = self._approaches[edge]
         seen = [period.of_detector(lane.advance) for lane in lanes]
@@ -204,7 +246,7 @@ class Arrivals:
         return sorted(arrivals, key=lambda row: row[0])
 
     def _by_edge(self, vehicles: Iterable[ET.Element], period: Period) -> dict[str, Array]:
-        """Count vehicles that would reach the end of each counted edge, ``(bins,)``."""
+        """Count vehicles that would reach the end of each counted edge, see `DemandBalance`."""
         bins = bins_in(period.length_s, self._thresholds)
         times: dict[str, list[float]] = {edge: [] for edge in self._counted}
         for element in vehicles:
@@ -224,7 +266,7 @@ class _Way:
     """A route at the speed limit.
 
     Attributes:
-        counted: Edges with detectors, each with the time from departure to its end, s.
+        counted: Counted edges and turns, each with the time from departure to the edge's end, s.
         approach: First edge of the route with advance detectors; None if there is none.
         approach_s: Time from departure to its advance detector, s.
         following: Next edge after `approach`; None at the end of the route.
@@ -254,10 +296,33 @@ class _Coming:
     following: str | None
     element: ET.Element
 
+    def fits(self, edges: frozenset[str]) -> bool:
+        """Return True if a lane that leads to these edges leads to the vehicle's next edge."""
+        return self.following is None or self.following in edges
+
+
+def _left_by(stopping: Sequence[_Coming], came: Sequence[_Came], period: Period) -> list[_Came]:
+    """Return the measured arrivals that vehicles with a stop leave to others.
+
+    Each of them takes the arrival that is nearest in time, of those whose lane leads to its next
+    edge.
+
+    Args:
+        stopping: Vehicles with a stop, on their way to one approach.
+        came: Measured arrivals there.
+        period: The measured period; who comes after it takes none.
+    """
+    left = list(came)
+    for one in stopping:
+        fits = [place for place, (_, following) in enumerate(left) if one.fits(following)]
+        if fits and one.time_s < period.end_s:
+            del left[min(fits, key=lambda place: abs(left[place][0] - one.time_s))]
+    return left
+
 
 def _filled(
     pool: Sequence[_Coming],
-    came: Sequence[tuple[float, frozenset[str]]],
+    came: Sequence[_Came],
     earliest_s: float,
     thresholds: DayThresholds,
 ) -> list[ET.Element]:
@@ -279,7 +344,7 @@ def _filled(
     taken = np.zeros(len(pool), np.int64)
     fits: dict[frozenset[str], NDArray[np.bool_]] = {}
     for edges in {edges for _, edges in came}:
-        led = np.array([one.following is None or one.following in edges for one in pool])
+        led = np.array([one.fits(edges) for one in pool])
         fits[edges] = led if led.any() else ~led
     vehicles: list[ET.Element] = []
     for time, following in came:
@@ -296,16 +361,23 @@ def _filled(
     return vehicles
 
 
-def corrected(counted: Tally, layout: DetectorLayout, due: DemandBalance) -> Tally:
+def corrected(
+    counted: Tally,
+    layout: DetectorLayout,
+    due: DemandBalance,
+    turns: Sequence[tuple[str, str]] = (),
+) -> Tally:
     """Return the tally of a day, with counts corrected to the model's demand.
 
     Corrected count = count + share * (asked - given), where the share of a lane is its part of the
-    vehicles given to its edge. If none were given, the lanes of the edge share alike.
+    vehicles given to its edge. If none were given, the lanes of the edge share alike. The share of
+    a turn is the part of the period in which it was counted.
 
     Args:
         counted: Tally of a day with measured arrivals.
         layout: Lanes and detectors.
         due: Vehicles asked for and given.
+        turns: Edge and next edge of each member of the block of turning counts.
 
     Returns:
         The tally without platoon features, since these repeat the measured arrivals.
@@ -324,7 +396,16 @@ def corrected(counted: Tally, layout: DetectorLayout, due: DemandBalance) -> Tal
                 width = min(len(more), bins.shape[-1])
                 bins[line, place, :width] += share * more[:width]
     sums[[INDEX[name] for name in PLATOON_FEATURES]] = 0.0
-    return replace(counted, sums=sums, bins=np.maximum(bins, 0.0))
+    supplementary = dict(counted.supplementary)
+    if TURNING in supplementary and counted.window is not None:
+        begin_s, end_s = counted.window
+        supplementary[TURNING] = turning = supplementary[TURNING].copy()
+        for member, turn in enumerate(map(" ".join, turns)):
+            vehicles, counted_min = turning[member, 0]
+            share = 60.0 * counted_min / (end_s - begin_s)
+            more = float((due.asked[turn] - due.given[turn]).sum())
+            turning[member, 0, 0] = max(vehicles + share * more, 0.0)
+    return replace(counted, sums=sums, bins=np.maximum(bins, 0.0), supplementary=supplementary)
 
 
 def _approaches(layout: DetectorLayout, thresholds: DayThresholds) -> dict[str, tuple[_Lane, ...]]:

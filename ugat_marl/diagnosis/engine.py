@@ -110,7 +110,7 @@ def _counts(tallies: Sequence[Tally]) -> NDArray[np.float64]:
 
 # --- simulated days -------------------------------------------------------------------------------
 
-VERSION = 13
+VERSION = 14
 """Version of features and replays; tallies cached under another version are not used."""
 
 _READING = threading.Lock()
@@ -295,7 +295,9 @@ class Engine:
         head += ("intervals/2", interval_s) if interval_s else ()
         head += (supplementary,) if supplementary else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
-        self._edges = sorted({edge for _, edge, _ in layout.places})
+        self._turns = () if supplementary is None else supplementary.turns
+        edges = {edge for _, edge, _ in layout.places}
+        self._balanced = sorted(edges | set(map(" ".join, self._turns)))
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
         self._known_by: Callable[[], None] | None = None
         self._detection: tuple[Effect, ...] = ()
@@ -526,11 +528,7 @@ class Engine:
         new = key not in self._known
         day = self._known.get(key) or self._remembered(key, number)
         if day is None:
-            others = tuple(effect for effect in effects if not effect.on_departures)
-            if self._replay.answering and len(others) < len(effects):
-                day = self._asked_for(self._one(others, number), effects, number)
-            else:
-                day = self._counted(effects, number)
+            day = self._asked_for(effects, number) or self._counted(effects, number)
             self._remember(key, day)
         self._known[key] = day
         if (tell := self._known_by) is not None and new:
@@ -555,22 +553,33 @@ class Engine:
         counted = replace(counted, bins=counted.bins.astype(np.float32).astype(np.float64))
         return self._with_due(counted, day.travel_time_s, day.due)
 
-    def _asked_for(self, given: Replicate, effects: tuple[Effect, ...], number: int) -> Replicate:
-        """Return a simulated day corrected to the demand of a model with other departures."""
-        if given.counted is None or given.due is None:
-            return self._counted(effects, number)
+    def _asked_for(self, effects: tuple[Effect, ...], number: int) -> Replicate | None:
+        """Return the day without effects on departures, corrected to the demand with them.
+
+        Returns:
+            None if these effects change the simulation, or if there are none.
+        """
+        others = tuple(effect for effect in effects if not effect.on_departures)
+        if not self._replay.answering or len(others) == len(effects):
+            return None
         physics = [effect for effect in effects if not effect.on_detectors]
         period = self.periods[self.place_of(number)]
         seed = derive_seed(self._seed, "replicate", number)
-        due = DemandBalance(self._replay.asked(physics, period, seed), given.due.given)
-        return self._with_due(given.counted, given.travel_time_s, due)
+        asked = self._replay.asked(physics, period, seed)
+        given = None if asked is None else self._one(others, number)
+        if asked is None or given is None or given.counted is None or given.due is None:
+            return None
+        return self._with_due(
+            given.counted, given.travel_time_s, DemandBalance(asked, given.due.given)
+        )
 
     def _with_due(
         self, counted: Tally, travel_time_s: float, due: DemandBalance | None
     ) -> Replicate:
         if due is None:
             return Replicate(counted, travel_time_s)
-        return Replicate(corrected(counted, self.layout, due), travel_time_s, counted, due)
+        tally = corrected(counted, self.layout, due, self._turns)
+        return Replicate(tally, travel_time_s, counted, due)
 
     def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
         """Return a day as the detectors saw it; faults of detectors need no new simulation."""
@@ -648,7 +657,8 @@ class Engine:
             due = None
             if "asked" in stored:
                 asked, given = (
-                    dict(zip(self._edges, stored[name], strict=True)) for name in ("asked", "given")
+                    dict(zip(self._balanced, stored[name], strict=True))
+                    for name in ("asked", "given")
                 )
                 due = DemandBalance(asked, given)
             return self._with_due(counted, float(stored["travel_time_s"]), due)
@@ -666,7 +676,7 @@ class Engine:
         }
         if day.due is not None:
             for name, of_edge in (("asked", day.due.asked), ("given", day.due.given)):
-                arrays[name] = np.stack([of_edge[edge] for edge in self._edges])
+                arrays[name] = np.stack([of_edge[edge] for edge in self._balanced])
         self._store(key, arrays)
 
     def _stored(self, key: str) -> dict[str, Any] | None:

@@ -144,7 +144,8 @@ class Replay:
         self.followed = tuple(followed)
         self.watched = tuple(watched)
         layout = DetectorLayout.of(network, installed_detectors(self._detection, detectors))
-        self._arrivals = Arrivals(layout, network, thresholds) if answering else None
+        turns = [(first.edge, last.edge) for first, last in self.followed]
+        self._arrivals = Arrivals(layout, network, thresholds, turns) if answering else None
         self._own = detector_effects(scenario)
         self._days: OrderedDict[int, Scenario] = OrderedDict()
         self._lock = threading.Lock()
@@ -181,11 +182,8 @@ class Replay:
         Raises:
             SimulatorError: SUMO refused, or its process crashed repeatedly.
         """
-        day = self._day(seed)
-        scenario, due, earliest_s = Effect.apply_all(day, effects), None, math.inf
+        (scenario, drivers), due, earliest_s = self._models(effects, seed), None, math.inf
         if self._arrivals is not None:
-            others = [effect for effect in effects if not effect.on_departures]
-            drivers = scenario if len(others) == len(effects) else Effect.apply_all(day, others)
             came = period
             for error in reversed(self._detection):
                 came = error.undone(came, self._detectors)
@@ -232,17 +230,29 @@ class Replay:
             steps = max(math.floor(earliest), 0)
         return settings.begin_s + step_s * steps
 
-    def asked(self, effects: Sequence[Effect], period: Period, seed: int) -> Mapping[str, Array]:
+    def asked(
+        self, effects: Sequence[Effect], period: Period, seed: int
+    ) -> Mapping[str, Array] | None:
         """Return the vehicles that a day of a model asks for, without a simulation.
 
-        They are `DemandBalance.asked`.
+        Returns:
+            `DemandBalance.asked`; None if effects on departures change the simulation, as they do
+            where approaches have no advance detectors.
 
         Raises:
             ValueError: The days get no measured arrivals.
         """
         if self._arrivals is None:
             raise ValueError("no arrivals are given in the place of those asked for")
-        return self._arrivals.asked(Effect.apply_all(self._day(seed), effects), period)
+        return self._arrivals.asked(*self._models(effects, seed), period)
+
+    def _models(self, effects: Sequence[Effect], seed: int) -> tuple[Scenario, Scenario]:
+        """Return a day with effects, and the same day without those on departures."""
+        day = self._day(seed)
+        others = [effect for effect in effects if not effect.on_departures]
+        scenario = Effect.apply_all(day, effects)
+        alike = self._arrivals is None or len(others) == len(effects)
+        return scenario, scenario if alike else Effect.apply_all(day, others)
 
     def _day(self, seed: int) -> Scenario:
         with self._lock:
