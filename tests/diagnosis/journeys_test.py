@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -49,15 +51,24 @@ def test_a_vehicle_may_change_lanes_between_the_detectors() -> None:
 def test_a_missed_vehicle_does_not_shift_the_vehicles_after_the_next_free_one() -> None:
     # The stop detector missed the vehicle of 10 s; everyone drives freely and needs 2 s.
     came = [np.array([10.0, 20.0, 40.0, 60.0])]
-    shifted, _ = matched(came, [crossings(22.0, 42.0, 62.0)], [2.0], 8.0)
+    shifted, _ = matched(came, [crossings(22.0, 42.0, 62.0)], [2.0], [10.0])
     assert shifted == [[(10.0, 22.0), (20.0, 42.0), (40.0, 62.0)]]
-    pairs, _ = matched(came, [crossings(22.0, 42.0, 62.0, free=(22.0,))], [2.0], 8.0)
+    pairs, _ = matched(came, [crossings(22.0, 42.0, 62.0, free=(22.0,))], [2.0], [10.0])
     assert pairs == [[(20.0, 22.0), (40.0, 42.0), (60.0, 62.0)]]
 
 
 def test_a_free_vehicle_that_nobody_saw_come_has_no_travel_time() -> None:
-    pairs, _ = matched([np.array([0.0, 90.0])], [crossings(60.0, free=(60.0,))], [2.0], 8.0)
+    pairs, _ = matched([np.array([0.0, 90.0])], [crossings(60.0, free=(60.0,))], [2.0], [10.0])
     assert pairs == [[]]
+
+
+def test_who_left_another_lane_unseen_does_not_hide_the_arrival_on_a_third_lane() -> None:
+    """The vehicle of 58 s changes to the first lane; the stop detector missed that of 0 s."""
+    came = [np.array([]), np.array([0.0]), np.array([58.0, 70.0])]
+    crossed = [crossings(60.0, free=(60.0,)), crossings(), crossings(95.0)]
+    pairs, waiting = matched(came, crossed, [2.0] * 3, [10.0] * 3)
+    assert pairs == [[(58.0, 60.0)], [], [(70.0, 95.0)]]
+    assert [list(queue) for queue in waiting] == [[], [0.0], []]
 
 
 def test_the_free_ones_are_quick_apart_and_not_at_the_begin_of_green() -> None:
@@ -76,6 +87,26 @@ def test_without_speeds_a_free_vehicle_is_known_on_a_zone_of_any_length(
     stop = Passages(on, on + over, np.full(2, np.nan), np.full(2, np.nan))
     seen = Crossings.of(stop, np.array([30.0]), zone_m, 0.85 * limit_mps, 5.0)
     assert seen.free.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("setback_m", [28.0, 300.0, 600.0])
+@pytest.mark.parametrize("pace", [0.87, 1.0, 1.2])
+def test_free_rides_take_what_they_take_from_any_detector(setback_m: float, pace: float) -> None:
+    line = replace(DETECTORS[1], position_m=100.0 + setback_m)
+    layout = replace(LAYOUT, detectors=(DETECTORS[0], line))
+    greens = Greens(*(np.array([x]) for x in (10.0, 900.0, 903.0, 1000.0)), np.array([True]))
+    came = np.arange(50.0, 800.0, 13.0)
+    ride = setback_m / (14.0 * pace)
+    seen = {
+        "far": passages(came.tolist(), [14.0 * pace] * len(came)),
+        "line": passages((came + ride).tolist(), [14.0 * pace] * len(came)),
+    }
+    period = Period("day", 0.0, 1000.0, "fit", {}, seen)
+    day = tally(layout, period, [greens], Thresholds())
+    assert day.journeys is not None
+    total, number = day.journeys[0, 0]
+    assert number == len(came)
+    assert total / number == pytest.approx(ride + 0.5)  # its rear leaves half a second later
 
 
 def test_sums_of_one_lane() -> None:

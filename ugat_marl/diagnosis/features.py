@@ -770,7 +770,10 @@ def _journeys(
             crossed.append(Crossings.of(stop, starts, zone_m, pace_mps, gap_s))
         rides = [layout.ride_s(index) for index in lanes]
         pairs, _ = matched(
-            came, crossed, [ride / thresholds.fastest for ride in rides], thresholds.slack_s
+            came,
+            crossed,
+            [ride / thresholds.fastest for ride in rides],
+            [ride / thresholds.free + thresholds.slack_s for ride in rides],
         )
         for index, of_lane, ride in zip(lanes, pairs, rides, strict=True):
             sums[:, index] = journey_sums(of_lane, ride, greens[index].start_s)

@@ -64,18 +64,19 @@ def matched(
     came: Sequence[Array],
     crossed: Sequence[Crossings],
     travel_s: Sequence[float],
-    slack_s: float = np.inf,
+    free_s: Sequence[float] | None = None,
 ) -> tuple[list[list[tuple[float, float]]], list[deque[float]]]:
     """Match vehicles at the stop detectors of an approach to arrivals.
 
     A vehicle is matched to the earliest arrival on its lane that has not left yet. If there is
-    none, it is matched to the earliest such arrival on the other lanes.
+    none, it is matched to the earliest such arrival on the other lanes. A vehicle that nothing held
+    up takes no arrival from so long ago that it must be another's.
 
     Args:
         came: Times at the advance detectors in order, per lane, s.
         crossed: Vehicles at the stop detectors, per lane.
         travel_s: Least time from the advance to the stop detector, per lane, s.
-        slack_s: Time by which a vehicle that nothing held up may have taken longer, s.
+        free_s: Most time of vehicles that nothing held up, per lane, s; None for no limit.
 
     Returns:
         Pairs of arrival and crossing by lane of the crossing, and arrivals that never left.
@@ -89,13 +90,13 @@ def matched(
     )
     for time, lane, free in events:
         latest = time - travel_s[lane]
-        source = waiting[lane]
-        earliest = latest - slack_s if free else -np.inf
-        while source and source[0] < earliest:
-            source.popleft()  # it left unseen, or on another lane
-        if not source or source[0] > latest:
-            source = min(waiting, key=lambda queue: queue[0] if queue else np.inf)
-        if source and earliest <= source[0] <= latest:
+        earliest = time - free_s[lane] if free and free_s is not None else -np.inf
+        own = waiting[lane]
+        while own and own[0] < earliest:
+            own.popleft()  # it left unseen, or on another lane
+        sources = [queue for queue in waiting if queue and earliest <= queue[0] <= latest]
+        if sources:
+            source = min(sources, key=lambda queue: (queue is not own, queue[0]))
             pairs[lane].append((source.popleft(), time))
     return pairs, waiting
 

@@ -170,9 +170,9 @@ class DayThresholds:
     # --- journeys: travel times and queues that no fit uses -----------------------------------
 
     slack_s: float = 8.0
-    """Time by which a vehicle that crosses the stop line freely may have been slower than at the
-    speed limit since the advance detector, s. By hand. Halved: vehicles that met the end of a
-    queue have no travel time."""
+    """Time by which a vehicle that crosses the stop line freely may have been slower than at
+    `free` times the speed limit since the advance detector, s. By hand. Halved: vehicles that met
+    the end of a queue have no travel time."""
 
     def of_a_day(self) -> tuple[tuple[str, object], ...]:
         """Return the names and values of these numbers alone, for the key of cached days."""
