@@ -21,7 +21,7 @@ from ugat_marl.diagnosis.features import (
     IncomingLane,
     bins_in,
 )
-from ugat_marl.diagnosis.locate import _statistics, _stretches, locate
+from ugat_marl.diagnosis.locate import SHOWN, _statistics, _stretches, locate
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -203,6 +203,37 @@ def test_the_strongest_statistic_speaks_for_its_regime(reference: Reference) -> 
     shift[USED.index(INDEX["gap2"]), 0] = 8.0
     items = [item for item in found(reference, days(7, 5, shift)) if item.lane == "in0_0"]
     assert [(item.regime, item.statistic) for item in items] == [("discharge", "gap2")]
+
+
+def test_the_strongest_lane_is_among_many_wide_places() -> None:
+    """More wide places are found than are shown, and one lane is worst of all."""
+    lights, each = 16, 2
+    many = tuple(
+        IncomingLane(f"in{i}_0", f"in{i}", i // each, (0,), 14.0, {}) for i in range(lights * each)
+    )
+    site = DetectorLayout(tuple(f"T{i}" for i in range(lights)), many, (), (), {})
+    used = [INDEX[name] for name in ("lost", "free_speed", "platoon_gap", "red_speed")]
+
+    def of_all_lanes(seed: int, count: int, shift: float, worst: float) -> list[Tally]:
+        generator = np.random.default_rng(seed)
+        found: list[Tally] = []
+        for _ in range(count):
+            values = 10.0 + shift + generator.standard_normal((len(used), len(many)))
+            values[0, 5] += worst
+            sums = np.zeros((len(FEATURES), len(many), 2))
+            sums[used] = np.stack([40 * values, np.full_like(values, 40)], axis=-1)
+            found.append(Tally(sums, np.zeros((len(BIN_FEATURES), len(many), BINS))))
+        return found
+
+    model = Reference(Pools.of(site, THRESHOLDS), of_all_lanes(1, 60, 0.0, 0.0))
+    items = locate(site, model, model.distance(of_all_lanes(9, 5, 1.5, 20.0)), 0.05, None)
+    lanes = [item.lane for item in items]
+    assert len(items) == SHOWN
+    wide = lanes.count(None)
+    assert "in5_0" in lanes and lanes[:wide] == [None] * wide
+    sizes = [abs(item.z) for item in items]
+    assert sizes[:wide] == sorted(sizes[:wide], reverse=True)
+    assert sizes[wide:] == sorted(sizes[wide:], reverse=True)
 
 
 def test_disagreements_can_be_written(reference: Reference) -> None:

@@ -23,6 +23,8 @@ from ugat_marl.diagnosis.study import Study
 from ugat_marl.diagnosis.supplementary_data import SUPPLEMENTARY_MEASURES
 from ugat_marl.diagnosis.thresholds import Thresholds
 
+_Place = tuple[str | None, str | None, str | None]
+"""Traffic light, edge and lane; None for all."""
 SHOWN = 40
 """Largest number of disagreements that are reported."""
 _REGIME_OF_BINS = ("volume", "volume", "volume", "storage")
@@ -57,10 +59,12 @@ def locate(
     alpha: float,
     span: tuple[float, float] | None,
 ) -> tuple[Disagreement, ...]:
-    """Find the disagreements that remain after the control of false discoveries, strongest first.
+    """Find the strongest disagreements that remain after the control of false discoveries.
 
     The procedure of Benjamini and Hochberg (1995) covers all statistics of all pools and all
     stretches of time. Then the strongest statistic of each place and regime is kept.
+
+    Lanes come after wider places, and the strongest come first among either.
 
     Args:
         layout: Lanes and detectors.
@@ -83,7 +87,8 @@ def locate(
     tested = sum(int(block.used.sum()) for block in reference.blocks.values())
     candidates.sort(key=lambda one: one.p)
     kept = discoveries([one.p for one in candidates], tested, alpha)
-    return tuple(_gathered(candidates[:kept])[:SHOWN])
+    strongest = _gathered(candidates[:kept])[:SHOWN]
+    return tuple(sorted(strongest, key=lambda one: one.lane is not None))
 
 
 def discoveries(chances: Sequence[float], tested: int, alpha: float) -> int:
@@ -123,23 +128,35 @@ def _statistics(
             lane = None  # it is kept with the first of them
             if name == "kept_to_exit":
                 continue  # the light has it, too
-        value = float(z[member, feature])
-        size = float(difference[member, feature])
-        rows.append(
-            Disagreement(
-                tls,
-                approach,
-                lane,
-                regime,
-                name,
-                None,
-                size,
-                unit,
-                value,
-                two_sided(value, thresholds.heavy_tail),
-            )
-        )
+        both = float(difference[member, feature]), float(z[member, feature])
+        place = tls, approach, lane
+        rows.append(_disagreement(place, (regime, name, unit), *both, thresholds))
     return rows
+
+
+def _disagreement(
+    place: _Place,
+    statistic: tuple[str, str, str],
+    size: float,
+    z: float,
+    thresholds: Thresholds,
+    window: tuple[float, float] | None = None,
+    tests: float = 1.0,
+) -> Disagreement:
+    """Return a disagreement with its chance.
+
+    Args:
+        place: Traffic light, edge and lane.
+        statistic: Regime, name and unit.
+        size: Measured minus simulated.
+        z: The same in standard deviations.
+        thresholds: Numbers of the method.
+        window: Begin and end, s; None for all of the time.
+        tests: Number of windows of which this is the most unusual one.
+    """
+    regime, name, unit = statistic
+    p = min(1.0, tests * two_sided(z, thresholds.heavy_tail))
+    return Disagreement(*place, regime, name, window, size, unit, z, p)
 
 
 def _between(
@@ -151,21 +168,15 @@ def _between(
     for member, feature in zip(*np.nonzero(z), strict=True):
         label = reference.pools.supplementary[block][int(member)]
         name, unit = SUPPLEMENTARY_MEASURES[block][int(feature)]
-        value, size = float(z[member, feature]), float(difference[member, feature])
-        p = two_sided(value, reference.pools.thresholds.heavy_tail)
+        both = float(difference[member, feature]), float(z[member, feature])
         said = f"{name} {label.edge} → {label.following}" if label.following else name
-        rows.append(
-            Disagreement(
-                owner.get(label.edge), label.edge or None, label.lane or None, block, said, None,
-                size, unit, value, p,
-            )
-        )  # fmt: skip
+        place = owner.get(label.edge), label.edge or None, label.lane or None
+        thresholds = reference.pools.thresholds
+        rows.append(_disagreement(place, (block, said, unit), *both, thresholds))
     return rows
 
 
-def _place(
-    layout: DetectorLayout, pool: str, member: int
-) -> tuple[str | None, str | None, str | None]:
+def _place(layout: DetectorLayout, pool: str, member: int) -> _Place:
     if pool == "network":
         return (layout.intersections[0] if len(layout.intersections) == 1 else None, None, None)
     if pool == "intersection":
@@ -194,22 +205,18 @@ def _stretches(
             continue
         value, first, last = best
         kind, place = divmod(row, places)
-        tls, approach, lane = _place(layout, "lane", place)
         noise = np.where(used[row], difference[row] / np.where(used[row], z[row], 1.0), 0.0)
         size = float((difference[row] - middle * noise)[first:last].sum())  # as z: beside the rest
-        stretches = bins * (bins + 1) / 2
+        unit = "s" if kind == 3 else "vehicles"
         rows.append(
-            Disagreement(
-                tls,
-                approach,
-                lane,
-                _REGIME_OF_BINS[kind],
-                f"{BIN_FEATURES[kind]} in time",
-                (span[0] + width * first, span[0] + width * last),
+            _disagreement(
+                _place(layout, "lane", place),
+                (_REGIME_OF_BINS[kind], f"{BIN_FEATURES[kind]} in time", unit),
                 size,
-                "s" if kind == 3 else "vehicles",
                 value,
-                min(1.0, stretches * two_sided(value, thresholds.heavy_tail)),
+                thresholds,
+                window=(span[0] + width * first, span[0] + width * last),
+                tests=bins * (bins + 1) / 2,
             )
         )
     return rows
@@ -234,14 +241,10 @@ def _stretch(z: Array, thresholds: Thresholds) -> tuple[float, int, int] | None:
 
 
 def _gathered(discovered: Sequence[Disagreement]) -> list[Disagreement]:
-    """Keep the strongest statistic of each place, regime and kind of window."""
+    """Keep the strongest statistic of each place, regime and kind of window, strongest first."""
     best: dict[tuple[Any, ...], Disagreement] = {}
     for one in discovered:
         key = (one.tls, one.approach, one.lane, one.regime, one.window is None)
         if key not in best or abs(one.z) > abs(best[key].z):
             best[key] = one
-    wide = [one for one in best.values() if one.lane is None]
-    narrow = [one for one in best.values() if one.lane is not None]
-    wide.sort(key=lambda one: -abs(one.z))
-    narrow.sort(key=lambda one: -abs(one.z))
-    return [*wide, *narrow]
+    return sorted(best.values(), key=lambda one: -abs(one.z))

@@ -179,8 +179,8 @@ class Located:
 
     Attributes:
         base: The scenario as it is, tested.
-        disagreements: Places and regimes, strongest first; empty if the data do not contradict
-            `base`.
+        disagreements: The strongest places and regimes, see `locate`; empty if the data do not
+            contradict `base`.
         complete: False if the budget ended before the test along single effects.
         examined: Names of the effects that were simulated for this test.
     """
