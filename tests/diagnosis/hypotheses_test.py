@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -108,6 +110,35 @@ def test_the_reaction_step_starts_at_the_step_of_the_simulation(single: Scenario
     assert item.clipped((2.6,)) == (3.0,)
 
 
+@pytest.mark.parametrize(
+    ("settings", "nominal", "level"),
+    [
+        ({"step_length_s": 0.5}, 0.5, 2.0),
+        ({"step_length_s": 0.5, "sumo": {"default.action-step-length": "1.5"}}, 1.5, 3.0),
+        ({"sumo": {"default.action-step-length": "0.5"}}, 1.0, 2.0),
+    ],
+)
+def test_a_reaction_step_that_changes_nothing_is_sumos_own(
+    single: Scenario, settings: dict[str, Any], nominal: float, level: float
+) -> None:
+    item = by_name(with_settings(single, **settings))["reaction_step"]
+    assert (item.nominal, item.levels) == ((nominal,), ((level,),))
+    assert item.is_nothing((nominal,))
+
+
+@pytest.mark.parametrize(("seconds", "levels"), [(2, ((4.0,),)), (3, ((5.0,),)), (5, ())])
+def test_strengths_are_those_that_are_simulated(
+    single: Scenario, seconds: int, levels: tuple[tuple[float, ...], ...]
+) -> None:
+    """Twice the reaction step may lie beyond its range."""
+    item = by_name(apply_effects(single, parse_domain(f"reaction_step={seconds}")))["reaction_step"]
+    assert item.levels == levels
+
+
+def with_settings(scenario: Scenario, **changed: Any) -> Scenario:
+    return replace(scenario, settings=scenario.settings.model_copy(update=changed))
+
+
 def test_drivers_that_are_there_already_are_no_hypothesis(
     single: Scenario, crossing: Crossing
 ) -> None:
@@ -116,6 +147,8 @@ def test_drivers_that_are_there_already_are_no_hypothesis(
         return [dict(item.fixed)["model"] for item in found]
 
     assert models(single) == ["IDM", "EIDM", "W99"]
+    by_option = with_settings(single, sumo={"default.carfollowmodel": "EIDM"})
+    assert models(by_option) == ["IDM", "W99"]
     types = '<vType id="x" vClass="passenger" carFollowModel="IDM"/>'
     assert models(load_scenario(crossing(vehicles=CARS, types=types))) == ["EIDM", "W99"]
 

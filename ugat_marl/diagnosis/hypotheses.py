@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from statistics import fmean
 from typing import Any
 
@@ -150,43 +150,50 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         allowed: Names of effects to examine.
     """
     hypotheses: list[Hypothesis] = []
-    step = scenario.settings.step_length_s
     for name in GLOBAL:
         if name not in allowed:
             continue
-        kind, entry = known_effects()[name], examined(name)
-        numbers = type_numbers(scenario, kind.attribute, entry.nominal)
-        if name == "reaction_step":  # no driver decides more often than the simulation steps
-            numbers = sorted({max(number, step) for number in numbers})
+        kind = known_effects()[name]
+        entry, numbers = _examined_in(scenario, name)
         nominal = fmean(numbers)
         extreme = tuple((level,) for level in entry.extreme)
-        levels = tuple((level,) for level in entry.levels if abs(level - nominal) > entry.least)
-        if name == "reaction_step":
-            levels = ((2 * nominal,),)
-        fixed = tuple((place, EVERYWHERE) for place in kind.texts)
-        grid = step if name == "reaction_step" else entry.step
-        hypotheses.append(
-            Hypothesis(
-                name,
-                fixed,
-                tuple(kind.ranges),
-                levels + extreme,
-                (nominal,),
-                entry.least,
-                grid,
-                entry.both,
-                extreme,
-                neutral=len(numbers) == 1,
-            )
+        hypothesis = Hypothesis(
+            name,
+            tuple((place, EVERYWHERE) for place in kind.texts),
+            tuple(kind.ranges),
+            (),
+            (nominal,),
+            entry.least,
+            entry.step,
+            entry.both,
+            extreme,
+            neutral=len(numbers) == 1,
         )
+        levels = (hypothesis.clipped((level,)) for level in entry.levels)
+        apart = tuple(level for level in levels if abs(level[0] - nominal) > entry.least)
+        hypotheses.append(replace(hypothesis, levels=apart + extreme))
     if "driver_model" in allowed:
-        now = type_values(scenario, "carFollowModel")
+        usual = str(scenario.settings.sumo.get("default.carfollowmodel", ""))
+        now = type_values(scenario, "carFollowModel", usual)
         hypotheses += [
             Hypothesis("driver_model", (("model", model),), (), ((),), None)
             for model in MODELS
             if now != {model}
         ]
     return hypotheses
+
+
+def _examined_in(scenario: Scenario, name: str) -> tuple[ExaminedStrengths, list[float]]:
+    """Return the strengths of an effect of `GLOBAL`, and its numbers in a scenario's types."""
+    entry, attribute = examined(name), known_effects()[name].attribute
+    if name != "reaction_step":
+        return entry, type_numbers(scenario, attribute, entry.nominal)
+    # By default drivers decide in each step of the simulation, and none decides more often.
+    step_s = scenario.settings.step_length_s
+    usual_s = float(scenario.settings.sumo.get("default.action-step-length", step_s))
+    numbers = sorted({max(each, step_s) for each in type_numbers(scenario, attribute, usual_s)})
+    levels = tuple(max(level, 2.0 * fmean(numbers)) for level in entry.levels)
+    return replace(entry, levels=levels, step=step_s), numbers
 
 
 def cautious_drivers(hypotheses: Sequence[Hypothesis]) -> list[Members]:
@@ -207,7 +214,8 @@ def cautious_drivers(hypotheses: Sequence[Hypothesis]) -> list[Members]:
         if name not in known:
             return []
         hypothesis = known[name]
-        (usual,) = hypothesis.nominal or (0.0,)
+        assert hypothesis.nominal is not None
+        (usual,) = hypothesis.nominal
         plausible = (level for level in hypothesis.levels if level not in hypothesis.extreme)
         cautious = [level for level in plausible if sign * (level[0] - usual) > 0]
         if not cautious:
