@@ -59,8 +59,9 @@ class Diagnose:
             (docs/reference/measured-data.md). Nothing is written to it.
         out: Directory for diagnosis.json, report.html and the corrected scenario. An earlier
             diagnosis in it is replaced.
-        budget_h: Simulated hours after which no further simulation begins; stored days are free.
-            The result is then provisional; the same command continues from there.
+        budget_h: Simulated hours after which no further simulation begins; stored days are free,
+            and so is the warm-up before each measured period. The result is then provisional; the
+            same command continues from there.
         budget_s: Time in s after which no further simulation begins either.
         alpha: Chance of naming an effect if there is none.
         seed: Root of the simulated days; the same data and seed give the same diagnosis.

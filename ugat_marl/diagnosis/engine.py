@@ -158,7 +158,8 @@ class OutOfTime(UgatMarlError):
 class Budget:
     """Work that a diagnosis may do: simulated hours, and wall time if that is limited too.
 
-    Days from the cache are no work.
+    Days from the cache are no work. The hours are those of the measured periods; the warm-up before
+    them does not count.
 
     Args:
         hours: Simulated hours after which new simulations are refused.

@@ -173,7 +173,7 @@ def global_hypotheses(scenario: Scenario, allowed: Collection[str]) -> list[Hypo
         apart = tuple(level for level in levels if abs(level[0] - nominal) > entry.least)
         hypotheses.append(replace(hypothesis, levels=apart + extreme))
     if "driver_model" in allowed:
-        usual = str(scenario.settings.sumo.get("default.carfollowmodel", ""))
+        usual = scenario.settings.sumo.get("default.carfollowmodel", "")
         now = type_values(scenario, "carFollowModel", usual)
         hypotheses += [
             Hypothesis("driver_model", (("model", model),), (), ((),), None)

@@ -77,7 +77,7 @@ class DiagnosisConfig:
 
     Attributes:
         budget_h: Simulated hours after which no further simulation is begun. Days from the cache
-            do not count.
+            do not count, nor does the warm-up before a period.
         budget_s: Wall time after which no further simulation is begun either, s; None for no limit.
         alpha: Level of the tests: chance of naming an effect where there is none.
         seed: Root seed of the simulated days.
