@@ -46,6 +46,7 @@ class Streets(Replay):
 
     def __init__(self, layout: DetectorLayout) -> None:
         self.calls: list[tuple[tuple[str, ...], str, int]] = []
+        self.answering, self.day_to_day = False, 0.0
         self._layout = layout
         self._calls = threading.Lock()
 

@@ -85,6 +85,14 @@ class Greens:
     next_s: NDArray[np.float64]
     protected: NDArray[np.bool_]
 
+    def last_begun(self, times: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the index of the last green that has begun at each time, and if any has.
+
+        Where none has, the index is 0.
+        """
+        index = np.searchsorted(self.start_s, times, "right") - 1
+        return np.maximum(index, 0), index >= 0
+
 
 @dataclass(frozen=True)
 class DetectorLayout:
@@ -545,8 +553,8 @@ class Discharge:
         if not len(stop) or not len(greens.start_s):
             return None
         crossed = stop.off_s
-        cycle = np.searchsorted(greens.start_s, crossed, "right") - 1
-        inside = (cycle >= 0) & (crossed <= greens.red_s[np.maximum(cycle, 0)])
+        cycle, begun = greens.last_begun(crossed)
+        inside = begun & (crossed <= greens.red_s[cycle])
         stop, crossed, cycle = stop.at(inside), crossed[inside], cycle[inside]
         if not len(stop):
             return None
@@ -644,11 +652,10 @@ def free_vehicles(
 ) -> NDArray[np.bool_]:
     """Mark vehicles over an advance detector that drive freely towards a settled green."""
     on = advance.on_s
-    cycle = np.searchsorted(greens.start_s, on, "right") - 1
-    inside = np.maximum(cycle, 0)
-    green = (cycle >= 0) & (on < greens.end_s[inside])
+    cycle, begun = greens.last_begun(on)
+    green = begun & (on < greens.end_s[cycle])
     apart = np.append(np.inf, np.diff(on)) > thresholds.free_gap_s
-    return green & apart & (on - greens.start_s[inside] > thresholds.settled_green_s)
+    return green & apart & (on - greens.start_s[cycle] > thresholds.settled_green_s)
 
 
 def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: float) -> None:
@@ -673,12 +680,9 @@ def _approach(counter: _Counter, advance: Passages, greens: Greens, limit_mps: f
     counter.add("platoon_time", over[platoon])
     if not len(greens.start_s):
         return
-    cycle = np.searchsorted(greens.start_s, on, "right") - 1
-    inside = np.maximum(cycle, 0)
+    cycle, begun = greens.last_begun(on)
     red = (
-        (cycle >= 0)
-        & (on > greens.red_s[inside])
-        & (on < greens.next_s[inside] - thresholds.before_green_s)
+        begun & (on > greens.red_s[cycle]) & (on < greens.next_s[cycle] - thresholds.before_green_s)
     )
     free = free_vehicles(advance, greens, thresholds)
     counter.add("free_speed", speed[free])

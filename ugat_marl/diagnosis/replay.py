@@ -112,11 +112,6 @@ class Replay:
         watched: SUMO ids of lanes whose state is kept.
     """
 
-    answering = False
-    day_to_day = 0.0
-    followed: tuple[Way, ...] = ()
-    watched: tuple[str, ...] = ()
-
     def __init__(
         self,
         scenario: Scenario,

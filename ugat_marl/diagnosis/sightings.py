@@ -210,10 +210,8 @@ class _Track:
 
 def _cycles(times: Array, greens: Greens) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the index of the last green that began before each time, and True inside a green."""
-    cycle = np.searchsorted(greens.start_s, times, "right") - 1
-    if not len(greens.start_s):
-        return np.zeros(len(times), np.int64), np.zeros(len(times), np.bool_)
-    return np.maximum(cycle, 0), (cycle >= 0) & (times < greens.end_s[np.maximum(cycle, 0)])
+    cycle, begun = greens.last_begun(times)
+    return cycle, begun & (times < greens.end_s[cycle]) if len(greens.start_s) else begun
 
 
 def _regimes_at_advance(track: _Track, greens: Greens, thresholds: Thresholds) -> NDArray[np.int64]:
