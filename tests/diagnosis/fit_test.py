@@ -220,6 +220,15 @@ def test_near_the_data_moves_are_shortened_to_where_statistics_are_linear() -> N
     assert near == pytest.approx(HEADWAY.least)
 
 
+@pytest.mark.parametrize("afar", [1.2, 5.0])
+def test_a_fit_whose_cost_still_falls_goes_on(afar: float) -> None:
+    """Of three steps from there the last one takes off nine tenths of the cost."""
+    fitter = a_fitter({"headway": 1.0 + 400.0 / 3.0}, street=17)
+    fitter.engine = Bent()
+    best = fitter.refine(fitter.simulate(start((HEADWAY, afar))), 1)
+    assert best.values[0] == pytest.approx(3.0, abs=0.005)
+
+
 EMERGENCY = Hypothesis("emergency_deceleration", (), ("mps2",), ((3.0,),), (9.0,), 0.5)
 
 

@@ -117,14 +117,15 @@ class Fitter:
 
         Args:
             start: The model to start from.
-            rounds: Largest number of steps; None for `Thresholds.steps`.
+            rounds: Largest number of steps; None for `Thresholds.steps`. While each takes more
+                than `Thresholds.falling` off the cost, they go on beyond it.
             directions: Changes of the statistics by single effects.
             closely: True if the data are near, see `changes`.
         """
         best, left = start, self.thresholds.steps if rounds is None else rounds
         changes = self._known_changes(start, directions)
-        exact = False
-        while left and len(best.values):
+        exact = falls = False
+        while (left > 0 or falls) and len(best.values):
             if changes is None:
                 changes, exact = self.changes(best, closely=closely), True
             after = self._after_step(best, changes)
@@ -135,6 +136,7 @@ class Fitter:
                 continue
             left -= 1
             gain, changes = best.cost - after.cost, self._corrected(changes, best, after)
+            falls = gain > self.thresholds.falling * best.cost
             best, exact = after, False
             if gain < self.thresholds.least_gain:
                 break

@@ -619,6 +619,9 @@ class Thresholds(DayThresholds):
     steps: int = 3
     """Largest number of steps of a candidate's fit. By hand: enough to compare candidates. Halved:
     values far from the first simulation are not reached."""
+    falling: float = 0.1
+    """Share of the cost above which a last step is followed by another one. By hand: such a fit is
+    not at its end. Halved: fits of sets that explain little take longer."""
     steps_of_the_best: int = 6
     """Largest number of further steps of the best set of a round. By hand: a step costs six days,
     and what a fit leaves behind is searched in a whole round. Halved: in worlds with three effects
