@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 import ugat_marl
@@ -40,6 +42,23 @@ def test_every_car_that_is_held_up_counts_once(short_entry: Scenario, domain: st
     assert rewards[-1] == pytest.approx(-60)
     near = Rewarder(env.network, "queue").rewards(env.snapshot, env.snapshot)
     assert near[0] > -5 if domain == "sim" else near[0] >= -60
+    env.close()
+
+
+@pytest.mark.parametrize("domain", ["sim", "reach=100"])
+def test_who_is_due_later_on_the_route_counts_once(domain: str, tmp_path: Path) -> None:
+    """All forty depart on the road at the light, where few find room."""
+    cars = "".join(
+        f'<vehicle id="{i}" depart="{i}" departEdge="1"><route edges="Ww wM ME"/></vehicle>'
+        for i in range(40)
+    )
+    env = ugat_marl.parallel_env(crossroads_with(cars, tmp_path, 50, 60), domain)
+    env.reset(seed=1)
+    (agent,) = env.agents
+    green = phase_with(env, "NM_0")
+    rewards = [env.step({agent: green})[1][agent] for _ in range(6)]
+    assert env.snapshot.backlog > 30
+    assert rewards[-1] == pytest.approx(-40)
     env.close()
 
 

@@ -18,7 +18,7 @@ TURNS = (("a", "x", (0, 1)), ("a", "y", (1,)), ("b", "x", (2,)))
 
 @dataclass
 class Roads:
-    """Stand-in for libsumo: vehicles with a lane (none: waiting to enter), a speed and a route."""
+    """Stand-in for libsumo: vehicles with a lane (or a road: due there), a speed and a route."""
 
     vehicles: dict[str, tuple[str, float, tuple[str, ...]]]
     asked: list[str] = field(default_factory=list[str])
@@ -39,10 +39,13 @@ class Roads:
 
         def at(name: str) -> int:
             lane, _, way = self.vehicles[name]
-            return way.index(lane[:-2]) if lane else -1
+            return way.index(lane[:-2]) if "_" in lane else -1
 
         def outside() -> list[str]:
-            return [name for name, (lane, _, _) in self.vehicles.items() if not lane]
+            return [name for name, (lane, _, _) in self.vehicles.items() if "_" not in lane]
+
+        def due(road: str) -> list[str]:
+            return [name for name, (lane, _, _) in self.vehicles.items() if lane == road]
 
         links = {"e_0": ("a_0", "f_0"), "f_0": ("b_0",)}
 
@@ -52,6 +55,7 @@ class Roads:
                 getLaneNumber=lambda road: 1,
                 getLastStepHaltingNumber=halting,
                 getLastStepVehicleIDs=on,
+                getPendingVehicles=due,
             ),
             vehicle=SimpleNamespace(
                 getSpeed=lambda name: self.vehicles[name][1],
@@ -78,10 +82,10 @@ def test_each_vehicle_belongs_to_the_next_light_of_its_route() -> None:
             "drives": ("e_0", 5.0, ("e", "a", "y")),
             "other light": ("f_0", 0.0, ("f", "b", "x")),
             "between two lights": ("f_0", 0.0, ("a", "y", "f", "b", "x")),
-            "waits outside": ("", 0.0, ("e", "f", "b", "x")),
+            "waits outside": ("e", 0.0, ("e", "f", "b", "x")),
             "at the light": ("a_1", 0.0, ("a", "y")),  # counted by the lane itself
             "past the last light": ("x_0", 0.0, ("a", "x")),
-            "meets no light": ("", 0.0, ("e", "f")),
+            "meets no light": ("e", 0.0, ("e", "f")),
         }
     )
     assert queued(roads) == [0.5, 1.5, 3.0, 0.0]
@@ -95,15 +99,23 @@ def test_what_a_reach_counts_is_left_out() -> None:
     roads = Roads(
         {
             "counted": ("e_0", 0.0, ("e", "a", "y")),
-            "a quarter is counted": ("", 0.0, ("f", "b", "x")),
+            "a quarter is counted": ("f", 0.0, ("f", "b", "x")),
             "beyond the reach": ("f_0", 0.0, ("f", "b", "x")),
         }
     )
     assert queued(roads, behind) == [0.0, 0.0, 1.75, 0.0]
 
 
+def test_a_vehicle_that_departs_later_on_its_route_belongs_to_the_light_after_that_road() -> None:
+    roads = Roads({"departs on f": ("f", 0.0, ("a", "y", "f", "b", "x"))})
+    behind = UpstreamLanes(lanes=((),) * 4, roads=((("a", 1.0),), (), (("f", 0.25),), ()))
+    assert queued(roads) == [0.0, 0.0, 1.0, 0.0]
+    assert queued(roads, behind) == [0.0, 0.0, 0.75, 0.0]
+    assert queued(Roads({"past it": ("y", 0.0, ("a", "y"))})) == [0.0] * 4
+
+
 def test_a_route_is_asked_for_once_on_each_road() -> None:
-    roads = Roads({"one": ("", 0.0, ("e", "f", "b", "x")), "two": ("e_0", 0.0, ("e", "a", "y"))})
+    roads = Roads({"one": ("e", 0.0, ("e", "f", "b", "x")), "two": ("e_0", 0.0, ("e", "a", "y"))})
     queues = UpstreamQueues(roads.api, LANES, TURNS, NO_UPSTREAM_LANES)
     for _ in range(3):
         queues.measure(1)

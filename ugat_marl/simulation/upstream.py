@@ -19,7 +19,7 @@ from ugat_marl.simulation.mesoscopic import MesoscopicLanes
 from ugat_marl.simulation.snapshots import HALTING_MPS
 
 _Place = tuple[str, tuple[int, ...]]
-"""Road on which a vehicle was last seen, and the lanes of its next light."""
+"""Road on which a vehicle was last seen ("" outside), and the lanes of its next light."""
 
 
 class UpstreamQueues:
@@ -32,6 +32,7 @@ class UpstreamQueues:
     left out.
 
     SUMO is asked one question for each such road, and further ones only about roads with a queue.
+    While vehicles wait to enter the network, it is asked who is due on each road.
     Roads from which no such light can be reached are left out. The routes of vehicles are asked for
     once on each road.
 
@@ -54,7 +55,9 @@ class UpstreamQueues:
         self._api = api
         self._count = len(lanes)
         self._turns = {(start, end): places for start, end, places in turns}
-        self._roads = _roads_before(api, {start for start, _, _ in turns})
+        at_lights = dict.fromkeys(start for start, _, _ in turns)
+        self._roads = _roads_before(api, at_lights)
+        self._entries = [*at_lights, *self._roads]
         self._queues: MesoscopicLanes | None = None
         if segment_m:
             every = [f"{road}_{n}" for road in self._roads for n in range(_width(api, road))]
@@ -78,10 +81,21 @@ class UpstreamQueues:
             for name in names:
                 counted = self._on_lane.get(vehicles.getLaneID(name), 0.0) if self._on_lane else 0.0
                 self._add(queued, name, road, 1.0 - counted, known)
-        for name in self._api.simulation.getPendingVehicles() if backlog else ():
-            counted = self._outside.get(vehicles.getRoute(name)[0], 0.0) if self._outside else 0.0
-            self._add(queued, name, "", 1.0 - counted, known)
+        for name, road in self._due() if backlog else ():
+            counted = self._outside.get(road, 0.0)
+            self._add(queued, name, road, 1.0 - counted, known, outside=True)
         return queued
+
+    def _due(self) -> Iterator[tuple[str, str]]:
+        """Yield the vehicles that wait to enter the network, and the roads on which they are due.
+
+        That is not always the first road of a route (``departEdge``).
+        """
+        due = self._api.edge.getPendingVehicles
+        roads = {name: road for road in self._entries for name in due(road)}
+        for name in self._api.simulation.getPendingVehicles():
+            if name in roads:
+                yield name, roads[name]
 
     def _halting(self) -> Iterator[tuple[str, Sequence[str]]]:
         """Yield the roads with a queue, and the vehicles that halt there."""
@@ -102,19 +116,23 @@ class UpstreamQueues:
         road: str,
         weight: float,
         known: dict[str, _Place],
+        *,
+        outside: bool = False,
     ) -> None:
         """Add a vehicle to the lanes of its next light."""
-        place = known.get(name)
-        if place is None or place[0] != road:
-            place = road, self._next_lanes(name)
+        place, where = known.get(name), "" if outside else road
+        if place is None or place[0] != where:
+            place = where, self._next_lanes(name, road)
         self._known[name] = place
         for lane in place[1]:
-            queued[lane] += max(weight, 0.0) / len(place[1])
+            queued[lane] += weight / len(place[1])
 
-    def _next_lanes(self, name: str) -> tuple[int, ...]:
+    def _next_lanes(self, name: str, road: str) -> tuple[int, ...]:
         """Return the lanes that lead across the next agent's light of a vehicle's route."""
         route = self._api.vehicle.getRoute(name)
-        at = max(self._api.vehicle.getRouteIndex(name), 0)
+        at = self._api.vehicle.getRouteIndex(name)
+        if at < 0:  # it has not entered the network
+            at = route.index(road)
         for turn in zip(route[at:], route[at + 1 :], strict=False):
             if turn in self._turns:
                 return self._turns[turn]
