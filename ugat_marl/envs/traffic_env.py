@@ -493,7 +493,8 @@ class TrafficEnv(ParallelEnv[str, Any, Any]):
 
     def _look(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
-        self._seen = snapshot if self._sensors is None else self._sensors.see(snapshot)
+        seen = snapshot.with_blockers()
+        self._seen = seen if self._sensors is None else self._sensors.see(seen)
 
     def _require_reset(self, what: str) -> None:
         if not hasattr(self, "_seen"):

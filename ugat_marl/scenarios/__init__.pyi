@@ -86,6 +86,7 @@ from .phases import kerb_turn_of as kerb_turn_of
 from .phases import turn_of as turn_of
 from .routes import DEPARTING as DEPARTING
 from .routes import TRAVELLERS as TRAVELLERS
+from .routes import blocker_departures as blocker_departures
 from .routes import blocker_types as blocker_types
 from .routes import demand_as_vehicles as demand_as_vehicles
 from .routes import demand_scale as demand_scale

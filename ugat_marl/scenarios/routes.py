@@ -44,13 +44,23 @@ def is_blocker(vehicle: str, vehicle_type: str) -> bool:
 
 def blocker_types(scenario: Scenario) -> tuple[str, ...]:
     """Return the types of the vehicles that effects have added to block lanes."""
+    return tuple(dict.fromkeys(vehicle.get("type", "") for vehicle in _blockers(scenario)))
+
+
+def blocker_departures(scenario: Scenario) -> tuple[tuple[str, float], ...]:
+    """Return the vehicles that effects have added to block lanes, with their departures in s."""
     return tuple(
-        vehicle.get("type", "")
-        for document in scenario.routes
-        if document.name.startswith(BLOCKERS)
-        for vehicle in [document.parse().find("vehicle")]
-        if vehicle is not None and is_blocker(vehicle.get("id", ""), vehicle.get("type", ""))
+        (vehicle.get("id", ""), parse_time(vehicle.get("depart", "")))
+        for vehicle in _blockers(scenario)
     )
+
+
+def _blockers(scenario: Scenario) -> Iterator[ET.Element]:
+    for document in scenario.routes:
+        if document.name.startswith(BLOCKERS):
+            for vehicle in document.parse().iter("vehicle"):
+                if is_blocker(vehicle.get("id", ""), vehicle.get("type", "")):
+                    yield vehicle
 
 
 class OwnEdges:

@@ -11,7 +11,7 @@ returns a `Snapshot`. At the end of an episode it returns `Trips`.
 - `worker`: the program of these processes.
 - `channel`: messages to and from a worker.
 - `snapshots`, `trips`, `detectors`, `point_to_point`, `lane_states`, `upstream`, `approach_delays`:
-  measurements.
+  measurements; `blockers`: vehicles that they leave out.
 """
 
 import lazy_loader

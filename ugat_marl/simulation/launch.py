@@ -23,6 +23,7 @@ from ugat_marl.scenarios import (
     Segment,
     Turns,
     UpstreamLanes,
+    blocker_departures,
     confine,
     confined_command,
     limit_memory,
@@ -65,6 +66,7 @@ class Launch:
         behind: Upstream lanes and roads, as in `ugat_marl.scenarios.lanes.LaneTable`.
         turns: Ways across the agents' lights, to measure queues upstream of `lanes`; empty to leave
             them out.
+        blockers: Vehicles that block lanes for effects, with their departures in s.
         reads: Files of the scenario that SUMO reads where they lie.
         outputs: Folders, besides its own, into which SUMO writes.
     """
@@ -82,6 +84,7 @@ class Launch:
     persons: tuple[tuple[str, float], ...] = ()
     behind: UpstreamLanes = NO_UPSTREAM_LANES
     turns: Turns = ()
+    blockers: tuple[tuple[str, float], ...] = ()
     reads: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
 
@@ -267,6 +270,7 @@ def launch_of(
         persons=tuple((persons or {}).items()),
         behind=behind,
         turns=turns,
+        blockers=blocker_departures(scenario),
         reads=tuple(reads),
         outputs=scenario.outputs,
     )

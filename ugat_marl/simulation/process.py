@@ -153,7 +153,7 @@ def simulator_of(option: str, deadline_s: float | None = None) -> Simulator:
 
 
 def _snapshot(reply: Message) -> Snapshot:
-    lanes, waiting, mean_left, near, queued_upstream = reply.arrays
+    lanes, waiting, mean_left, near, queued_upstream, detected = reply.arrays
     header = reply.header
     return Snapshot(
         header["time_s"],
@@ -166,6 +166,7 @@ def _snapshot(reply: Message) -> Snapshot:
         mean_left,
         near,
         queued_upstream,
+        detected,
     )
 
 
@@ -231,4 +232,4 @@ def _message(snapshot: Snapshot) -> Message:
     }
     lanes = np.array([snapshot.vehicles, snapshot.halting, snapshot.mean_speed_mps])
     others = [snapshot.waiting_s, snapshot.mean_left, snapshot.near, snapshot.queued_upstream]
-    return Message(header, [lanes, *others])
+    return Message(header, [lanes, *others, snapshot.detected])

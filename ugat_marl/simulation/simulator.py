@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ugat_marl.errors import SimulatorBusy, SimulatorError
 from ugat_marl.scenarios import UpstreamLanes
+from ugat_marl.simulation.blockers import Blockers
 from ugat_marl.simulation.crossings import Crossings
 from ugat_marl.simulation.host import one_line_message, too_much_memory
 from ugat_marl.simulation.launch import ERRORS, TRIPS, Launch, SignalPlans, VehiclePositions
@@ -51,6 +52,7 @@ class LibsumoSimulator:
         self._time_s = 0.0
         self._limits = np.empty(0)
         self._has_behind = False
+        self._blockers: Blockers | None = None
         self._mesoscopic: MesoscopicLanes | None = None
         self._upstream: UpstreamQueues | None = None
         self._crossings: Crossings | None = None
@@ -88,6 +90,9 @@ class LibsumoSimulator:
         self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
         lanes, roads = launch.behind
         self._has_behind = any(lanes) or any(roads)
+        self._blockers = None
+        if launch.blockers:
+            self._blockers = Blockers(libsumo, launch.lanes, launch.behind, launch.blockers)
         self._mesoscopic = None
         if launch.segment_m:
             self._mesoscopic = MesoscopicLanes(libsumo, launch.lanes, launch.segment_m)
@@ -202,6 +207,15 @@ class LibsumoSimulator:
         waiting_s = measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0)
         if self._has_behind:
             _add_those_behind(self._launch.behind, (vehicles, halting, speed_mps, waiting_s))
+        detected = np.empty(0)
+        if self._blockers is not None:
+            self._blockers.look(self._time_s)
+            departed -= self._blockers.departed
+            backlog -= len(self._blockers.waiting)
+            if self._blockers.standing or self._blockers.waiting:
+                waiting = waiting_s if waiting_s.size else none
+                detected = np.array([vehicles, halting, speed_mps, waiting])
+                self._blockers.leave_out((vehicles, halting, speed_mps, waiting_s), self._limits)
         return Snapshot(
             time_s=self._time_s,
             vehicles=vehicles,
@@ -212,6 +226,7 @@ class LibsumoSimulator:
             backlog=backlog,
             near=_near_the_end(lanes, names, self._limits, self._launch.zone_m),
             queued_upstream=upstream,
+            detected=detected,
         )
 
     def _fail(self, action: str, error: Exception) -> None:

@@ -21,6 +21,8 @@ def seconds_of(interval_s: float) -> NDArray[np.float64]:
 class Snapshot:
     """All measured lanes at one instant.
 
+    Vehicles that effects add to block a lane are left out, except in `near` and `detected`.
+
     Attributes:
         time_s: Time on the scenario's clock.
         vehicles: Number of vehicles per lane, ``(lanes,)``.
@@ -42,6 +44,8 @@ class Snapshot:
             roads upstream of it, up to the light before, or wait to enter the network,
             ``(lanes,)``; see `ugat_marl.simulation.upstream`. Empty unless the simulator was
             started with `turns`. Detectors of a street do not know it.
+        detected: Vehicles, halting vehicles, mean speed and waiting times with those that block a
+            lane, as detectors see them, ``(4, lanes)``. Empty while no vehicle blocks a lane.
     """
 
     time_s: float
@@ -54,12 +58,27 @@ class Snapshot:
     mean_left: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     near: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     queued_upstream: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    detected: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     @classmethod
     def idle(cls, lanes: int) -> Snapshot:
         """Return the snapshot of a network without vehicles; lanes have a mean speed of 1 m/s."""
         zeros = np.zeros(lanes)
         return cls(0.0, zeros, zeros, np.ones(lanes), zeros, 0, 0, queued_upstream=zeros)
+
+    def with_blockers(self) -> Snapshot:
+        """Return this snapshot with the vehicles that block a lane, as detectors see them."""
+        if not self.detected.size:
+            return self
+        vehicles, halting, speed_mps, waiting_s = self.detected
+        return replace(
+            self,
+            vehicles=vehicles,
+            halting=halting,
+            mean_speed_mps=speed_mps,
+            waiting_s=waiting_s if self.waiting_s.size else self.waiting_s,
+            detected=np.empty(0),
+        )
 
     def less(self, left: NDArray[np.float64]) -> Snapshot:
         """Return this snapshot without the vehicles that have `left`, ``(lanes,)``."""
