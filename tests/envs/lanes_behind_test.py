@@ -82,6 +82,49 @@ def test_who_waits_behind_is_counted(split: Scenario) -> None:
     env.close()
 
 
+def red_for_west(env: ugat_marl.envs.TrafficEnv) -> int:
+    (item,) = env.network.intersections
+    letter = next(link.index for link in item.links if link.from_lane == "wM_0")
+    return next(i for i, state in enumerate(item.phases) if state[letter] == "r")
+
+
+def test_the_queue_model_counts_them_as_car_following_does(split: Scenario) -> None:
+    for domain in ("sim", "meso"):
+        env = ugat_marl.parallel_env(split, domain)
+        env.reset(seed=1)
+        (agent,) = env.agents
+        for _ in range(6):
+            _, rewards, *_ = env.step({agent: red_for_west(env)})
+        lane = env.network.lane_table().ids.index("wM_0")
+        seen = env.snapshot
+        assert (seen.vehicles[lane], seen.halting[lane], seen.queued_upstream[lane]) == (8, 8, 0)
+        assert rewards[agent] == -8
+        env.close()
+
+
+@pytest.mark.parametrize("zone_m", [5, 9, 20, 50])
+def test_a_detection_zone_goes_on_behind_a_short_lane(
+    split: Scenario, zone_m: int, tmp_path: Path
+) -> None:
+    """As many are seen as on a road with a longer lane at the light."""
+    seen: list[tuple[float, ...]] = []
+    for scenario in (split, crossroads(tmp_path, 100)):
+        env = ugat_marl.parallel_env(
+            scenario, f"detection_zone={zone_m}", reward="waiting", observation="waiting"
+        )
+        env.reset(seed=1)
+        (agent,) = env.agents
+        for _ in range(7):
+            env.step({agent: red_for_west(env)})
+        lane = env.network.lane_table().ids.index("wM_0")
+        near = env.seen
+        assert near.mean_speed_mps[lane] == pytest.approx(0.0, abs=0.01)
+        assert near.waiting_s[lane] > 20 * near.vehicles[lane]
+        seen.append((near.vehicles[lane], near.halting[lane]))
+        env.close()
+    assert seen[0] == seen[1] and 1 <= seen[0][0] < 8
+
+
 def test_the_field_loop_counts_them_as_the_environment_does(split: Scenario) -> None:
     site = Site.of(split, {"observation": "count"})
     assert {"wM_0", "Ww_0"} <= set(site.capacity)

@@ -22,7 +22,7 @@ from ugat_marl.effects import (
     with_late_green_programmes,
 )
 from ugat_marl.errors import OptionError, ScenarioError
-from ugat_marl.scenarios import Network, sumo_program
+from ugat_marl.scenarios import Network, UpstreamLanes, sumo_program
 from ugat_marl.simulation.mesoscopic import MesoscopicLanes
 from ugat_marl.testing.episodes import play, random_actions
 
@@ -45,6 +45,12 @@ class FakeApi:
 
     def getLength(self, lane: str) -> float:
         return 200.0
+
+    def getLaneNumber(self, edge: str) -> int:
+        return 2
+
+    def getMaxSpeed(self, lane: str) -> float:
+        return 10.0
 
     def getLastStepVehicleIDs(self, edge: str) -> Sequence[str]:
         return [name for name, route in self.routes.items() if route[0] == edge]
@@ -92,6 +98,20 @@ def test_vehicles_count_where_their_routes_lead() -> None:
     )
 
 
+def test_those_behind_a_short_lane_count_by_their_share() -> None:
+    api = FakeApi()
+    behind = UpstreamLanes(((), (("in_0", 0.5), ("in_1", 0.25)), ()))
+    measured = MesoscopicLanes(api, ("wide_0", "one_0", "in_1"), 100.0, behind)
+    for name, following in (("a", "right"), ("b", "on"), ("c", "left")):
+        api.enter(name, "in", following)
+    api.held_s["c"] = 4.0
+    limits = np.full(3, 10.0)
+    assert measured.measure(0.0, limits).tolist() == [
+        [0, 0.5 + 2 * 0.25, 2], [0, 0.25, 1], [10, 6, 4], [0, 1, 4],
+    ]  # fmt: skip
+    assert list(measured.standing.items()) == [("c", "in_1")]
+
+
 def test_where_two_lanes_lead_on_the_queue_decides_and_then_the_shorter_one() -> None:
     api = FakeApi()
     measured = MesoscopicLanes(api, LANES, 100.0)
@@ -133,7 +153,7 @@ def test_a_slow_driver_in_free_flow_does_not_wait() -> None:
         api.enter(name, "in", "right")
     halting = [measured.measure(time_s, LIMITS)[1, 0] for time_s in (0.0, 8.0, 16.0, 24.0)]
     assert halting == [0, 0, 1, 2], "200 m take 40 and 20 s, half of them before the first look"
-    assert measured.standing == {"in": ["slow", "usual"]}
+    assert measured.standing == {"slow": "in_0", "usual": "in_0"}
 
 
 def test_of_a_queue_that_drives_off_as_many_move_as_have_left() -> None:

@@ -138,7 +138,8 @@ def validate_settings(raw: Mapping[str, Any], source: str) -> ScenarioFile:
     if control.reach_m and settings.is_mesoscopic:
         raise ScenarioError(
             f"{source}: control.reach_m = {control.reach_m:g}, but in SUMO's mesoscopic model "
-            "(queue_model) it is not counted who is upstream of a lane; leave out one of the two"
+            "(queue_model) only lanes shorter than a vehicle are counted with those upstream of a "
+            "lane; leave out one of the two"
         )
     model = settings.sumo.get("mesosim")
     if model is not None and (model != "true" or "meso-edgelength" not in settings.sumo):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ugat_marl.errors import OptionError
-from ugat_marl.scenarios import Scenario, edge_of_lane
+from ugat_marl.scenarios import NO_UPSTREAM_LANES, Scenario, UpstreamLanes, edge_of_lane
 from ugat_marl.simulation.snapshots import HALTING_MPS
 
 
@@ -84,13 +84,24 @@ class MesoscopicLanes:
         api: The module `libsumo`, with a running simulation.
         lanes: Lanes to measure.
         segment_m: Requested length of a segment.
+        behind: Lanes counted with short lanes.
 
     Attributes:
-        standing: Edge to its vehicles that halted at the last measurement.
+        standing: Vehicles that halted at the last measurement, each with its lane.
     """
 
-    def __init__(self, api: Any, lanes: Sequence[str], segment_m: float) -> None:
+    def __init__(
+        self,
+        api: Any,
+        lanes: Sequence[str],
+        segment_m: float,
+        behind: UpstreamLanes = NO_UPSTREAM_LANES,
+    ) -> None:
         self._api = api
+        further = _further_lanes(api, lanes, behind)
+        self._further_limits = [api.lane.getMaxSpeed(lane) for lane in further]
+        self._shares = _share_matrix(lanes, further, behind) if any(behind.lanes) else None
+        lanes = self._lanes = [*lanes, *further]
         self._count = len(lanes)
         self._index = [int(lane.rpartition("_")[2]) for lane in lanes]
         self._roads: dict[str, _Road] = {}
@@ -104,7 +115,7 @@ class MesoscopicLanes:
             road.segment_m = length / segments
             road.last_m = length * (1 - 1.5 / segments) if segments > 1 else -1.0
         self._routes: dict[str, Sequence[str]] = {}  # a vehicle's new route has a new name
-        self.standing: dict[str, list[str]] = {}
+        self.standing: dict[str, str] = {}
         self._measured_s = -math.inf
         self._left = [0] * self._count  # since the first vehicle of the lane was last held up
 
@@ -116,10 +127,11 @@ class MesoscopicLanes:
             limits: Speed of an empty lane, m/s, ``(lanes,)``.
         """
         vehicles, halting, speeds, waits = ([0.0] * self._count for _ in range(4))
+        limits_mps = np.append(limits, self._further_limits)
         names_on, api = self._api.edge.getLastStepVehicleIDs, self._api.vehicle
         position_m, waiting_s, speed_mps = api.getLanePosition, api.getWaitingTime, api.getSpeed
         passed_s = time_s - self._measured_s
-        self.standing = defaultdict(list)
+        self.standing = {}
         for road in self._roads.values():
             names, before = names_on(road.edge), road.stays
             if not names and not before:
@@ -150,7 +162,7 @@ class MesoscopicLanes:
                 speeds[lane] += speed
                 if speed < HALTING_MPS:
                     halting[lane] += 1.0
-                    self.standing[road.edge].append(name)
+                    self.standing[name] = self._lanes[lane]
                 if speed == 0:  # SUMO gives speed 0 to vehicles it holds up
                     waits[lane] += waiting_s(name)
             for name, stay in before.items():
@@ -161,12 +173,18 @@ class MesoscopicLanes:
                 standing = held_up[: max(len(held_up) - self._left[lane], 0)]
                 halting[lane] += len(standing)
                 waits[lane] += sum(waited for _, waited, _ in standing)
-                self.standing[road.edge] += [name for name, _, _ in standing]
-                speeds[lane] += _sum_of_speeds(held_up[len(standing) :], limits[lane])
+                self.standing |= {name: self._lanes[lane] for name, _, _ in standing}
+                speeds[lane] += _sum_of_speeds(held_up[len(standing) :], limits_mps[lane])
         self._measured_s = time_s
-        measured = np.array([vehicles, halting, speeds, waits])
+        return self._with_means(np.array([vehicles, halting, speeds, waits]), limits)
+
+    def _with_means(
+        self, sums: NDArray[np.float64], limits: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the result of `measure`, given the sums over the vehicles of each lane."""
+        measured = sums if self._shares is None else sums @ self._shares
         there = measured[0] > 0
-        measured[2] = np.where(there, measured[2] / np.maximum(measured[0], 1.0), limits)
+        measured[2] = np.where(there, measured[2] / np.where(there, measured[0], 1.0), limits)
         return measured
 
     def _entered(self, name: str, road: _Road, time_s: float, passed_s: float) -> _Stay:
@@ -179,7 +197,12 @@ class MesoscopicLanes:
         return _Stay(position_m, time_s - min(passed_s, drive_s) / 2, drive_s, lanes, -1)
 
     def _following(self, name: str, edge: str) -> str:
-        """Return the edge behind `edge` on a vehicle's route; empty if it ends there."""
+        """Return the edge behind `edge` on a vehicle's route; empty if it ends there.
+
+        It is also empty inside of a junction, where all lanes of an edge lead to the same one.
+        """
+        if edge.startswith(":"):
+            return ""
         number: str = self._api.vehicle.getRouteID(name)
         route = self._routes.get(number)
         if route is None:
@@ -202,6 +225,25 @@ class MesoscopicLanes:
         if stay.lane in stay.lanes:
             return stay.lane
         return min(stay.lanes, key=lambda place: vehicles[place])
+
+
+def _further_lanes(api: Any, lanes: Sequence[str], behind: UpstreamLanes) -> list[str]:
+    """Return the lanes of the roads behind short lanes that are not among the measured lanes."""
+    roads = dict.fromkeys(edge_of_lane(name) for counted in behind.lanes for name, _ in counted)
+    every = (f"{road}_{number}" for road in roads for number in range(api.edge.getLaneNumber(road)))
+    return [lane for lane in every if lane not in lanes]
+
+
+def _share_matrix(
+    lanes: Sequence[str], further: Sequence[str], behind: UpstreamLanes
+) -> NDArray[np.float64]:
+    """Return the share of each lane that counts with a measured one, ``(all lanes, lanes)``."""
+    shares = np.eye(len(lanes) + len(further), len(lanes))
+    places = {lane: place for place, lane in enumerate([*lanes, *further])}
+    for column, counted in enumerate(behind.lanes):
+        for name, share in counted:
+            shares[places[name], column] = share
+    return shares
 
 
 def _sum_of_speeds(held_up: Sequence[tuple[str, float, float]], limit_mps: float) -> float:

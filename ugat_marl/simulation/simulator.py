@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import libsumo
 import numpy as np
@@ -52,6 +53,7 @@ class LibsumoSimulator:
         self._time_s = 0.0
         self._limits = np.empty(0)
         self._has_behind = False
+        self._zones: list[list[_ZonePart]] = []
         self._blockers: Blockers | None = None
         self._mesoscopic: MesoscopicLanes | None = None
         self._upstream: UpstreamQueues | None = None
@@ -90,12 +92,15 @@ class LibsumoSimulator:
         self._limits = np.array([libsumo.lane.getMaxSpeed(lane) for lane in launch.lanes])
         lanes, roads = launch.behind
         self._has_behind = any(lanes) or any(roads)
+        self._zones = _zones(launch.lanes, launch.behind, launch.zone_m)
         self._blockers = None
         if launch.blockers:
             self._blockers = Blockers(libsumo, launch.lanes, launch.behind, launch.blockers)
         self._mesoscopic = None
         if launch.segment_m:
-            self._mesoscopic = MesoscopicLanes(libsumo, launch.lanes, launch.segment_m)
+            self._mesoscopic = MesoscopicLanes(
+                libsumo, launch.lanes, launch.segment_m, launch.behind
+            )
         self._crossings = Crossings(libsumo, launch.lanes) if launch.crossings else None
         self._upstream = None
         if launch.turns:
@@ -207,7 +212,9 @@ class LibsumoSimulator:
         waiting_s = measure(api.getWaitingTime, none) if self._launch.waiting else np.empty(0)
         if self._has_behind:
             _add_those_behind(self._launch.behind, (vehicles, halting, speed_mps, waiting_s))
-        detected = np.empty(0)
+        near = detected = np.empty(0)
+        if self._zones:
+            near = _near_the_end(self._zones, np.flatnonzero(vehicles).tolist(), self._limits)
         if self._blockers is not None:
             self._blockers.look(self._time_s)
             departed -= self._blockers.departed
@@ -224,7 +231,7 @@ class LibsumoSimulator:
             waiting_s=waiting_s,
             departed=departed,
             backlog=backlog,
-            near=_near_the_end(lanes, names, self._limits, self._launch.zone_m),
+            near=near,
             queued_upstream=upstream,
             detected=detected,
         )
@@ -242,32 +249,70 @@ class LibsumoSimulator:
         raise SimulatorError(f"{action}: {said}") from None
 
 
-def _near_the_end(
-    lanes: Sequence[str], taken: Sequence[str], limits_mps: _Floats, zone_m: float
-) -> _Floats:
-    """Return the vehicles at the end of each lane, as `Snapshot.near`, ``(4, lanes)``.
+class _ZonePart(NamedTuple):
+    """Part of the zone at the end of a lane.
+
+    Attributes:
+        lane: Lane on which it lies: the lane itself, or one that is counted with it.
+        begin_m: Position on that lane from which it reaches to the end.
+        share: Counted share of its vehicles.
+    """
+
+    lane: str
+    begin_m: float
+    share: float
+
+
+def _zones(lanes: Sequence[str], behind: UpstreamLanes, zone_m: float) -> list[list[_ZonePart]]:
+    """Return the parts of the zone at the end of each lane.
 
     Args:
         lanes: All lanes.
-        taken: Lanes with vehicles.
-        limits_mps: Speed limit of each lane.
-        zone_m: Length of the zone in metres; with 0 the result is an empty array.
+        behind: Upstream lanes counted with short ones.
+        zone_m: Length of the zones in metres; with 0 there are none.
     """
     if not zone_m:
-        return np.empty(0)
-    near = np.zeros((4, len(lanes)))
-    places = {lane: place for place, lane in enumerate(lanes)}
-    for lane in taken:
-        begins = libsumo.lane.getLength(lane) - zone_m
-        for name in libsumo.lane.getLastStepVehicleIDs(lane):
-            if libsumo.vehicle.getLanePosition(name) >= begins:
-                place, speed_mps = places[lane], libsumo.vehicle.getSpeed(name)
-                waiting_s, slower_mps = (
-                    libsumo.vehicle.getWaitingTime(name),
-                    limits_mps[place] - speed_mps,
-                )
-                near[:, place] += (1.0, speed_mps < HALTING_MPS, waiting_s, slower_mps)
-    near[3] /= np.maximum(near[0], 1.0)
+        return []
+    length_m = libsumo.lane.getLength
+    zones = [[_ZonePart(lane, length_m(lane) - zone_m, 1.0)] for lane in lanes]
+    for zone, shares in zip(zones, behind.lanes, strict=False):
+        ends_m = {zone[0].lane: 0.0}  # distances of the ends of lanes from the stop line
+        for _ in shares:  # each round finds a further lane, if one is left
+            for name, _ in shares:
+                for link in libsumo.lane.getLinks(name):
+                    ahead = link[4] or link[0]
+                    if ahead in ends_m:
+                        end_m = ends_m[ahead] + length_m(ahead)
+                        ends_m[name] = min(end_m, ends_m.get(name, end_m))
+        zone += [
+            _ZonePart(name, length_m(name) + ends_m[name] - zone_m, share)
+            for name, share in shares
+            if name in ends_m and ends_m[name] < zone_m
+        ]
+    return zones
+
+
+def _near_the_end(
+    zones: Sequence[Sequence[_ZonePart]], taken: Sequence[int], limits_mps: _Floats
+) -> _Floats:
+    """Return the vehicles in the zone at the end of each lane, as `Snapshot.near`, ``(4, lanes)``.
+
+    Args:
+        zones: Parts of each lane's zone.
+        taken: Positions of the lanes with vehicles.
+        limits_mps: Speed limit of each lane.
+    """
+    near = np.zeros((4, len(zones)))
+    api = libsumo.vehicle
+    for place in taken:
+        for lane, begin_m, share in zones[place]:
+            for name in libsumo.lane.getLastStepVehicleIDs(lane):
+                if api.getLanePosition(name) >= begin_m:
+                    speed_mps = api.getSpeed(name)
+                    waiting_s, slower_mps = api.getWaitingTime(name), limits_mps[place] - speed_mps
+                    seen = np.array([1.0, speed_mps < HALTING_MPS, waiting_s, slower_mps])
+                    near[:, place] += share * seen
+    near[3] /= np.where(near[0] > 0, near[0], 1.0)
     return near
 
 

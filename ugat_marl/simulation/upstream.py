@@ -76,14 +76,10 @@ class UpstreamQueues:
         """
         queued = np.zeros(self._count)
         known, self._known = self._known, {}
-        vehicles = self._api.vehicle
-        for road, names in self._halting():
-            for name in names:
-                counted = self._on_lane.get(vehicles.getLaneID(name), 0.0) if self._on_lane else 0.0
-                self._add(queued, name, road, 1.0 - counted, known)
+        for name, road, lane in self._halting():
+            self._add(queued, name, road, 1.0 - self._on_lane.get(lane, 0.0), known)
         for name, road in self._due() if backlog else ():
-            counted = self._outside.get(road, 0.0)
-            self._add(queued, name, road, 1.0 - counted, known, outside=True)
+            self._add(queued, name, road, 1.0 - self._outside.get(road, 0.0), known, outside=True)
         return queued
 
     def _due(self) -> Iterator[tuple[str, str]]:
@@ -97,17 +93,19 @@ class UpstreamQueues:
             if name in roads:
                 yield name, roads[name]
 
-    def _halting(self) -> Iterator[tuple[str, Sequence[str]]]:
-        """Yield the roads with a queue, and the vehicles that halt there."""
+    def _halting(self) -> Iterator[tuple[str, str, str]]:
+        """Yield the vehicles that halt, their roads, and their lanes if some are counted there."""
         if self._queues is not None:
             self._queues.measure(self._api.simulation.getTime(), self._limits)
-            yield from self._queues.standing.items()
+            for name, lane in self._queues.standing.items():
+                yield name, edge_of_lane(lane), lane
             return
         roads, vehicles = self._api.edge, self._api.vehicle
         for road in self._roads:
             if roads.getLastStepHaltingNumber(road):
-                names = roads.getLastStepVehicleIDs(road)
-                yield road, [name for name in names if vehicles.getSpeed(name) < HALTING_MPS]
+                for name in roads.getLastStepVehicleIDs(road):
+                    if vehicles.getSpeed(name) < HALTING_MPS:
+                        yield name, road, vehicles.getLaneID(name) if self._on_lane else ""
 
     def _add(
         self,
