@@ -144,6 +144,33 @@ def test_who_arrives_at_the_end_of_a_journey_has_left_too(
     np.testing.assert_allclose(left, [0, 0, 0, there.count(0) / 10])
 
 
+@pytest.mark.parametrize(
+    ("attributes", "end", "stop", "first_s", "last_s"),
+    [
+        ("", "ME", '<stop lane="wM_0" endPos="50" duration="60" parking="true"/>', 70, 100),
+        ("", "ME", '<stop lane="wM_0" endPos="50" duration="60"/>', 70, 100),
+        ("", "ME", '<stop lane="ME_0" endPos="50" duration="60" parking="true"/>', 10, 20),
+        ('arrivalPos="20"', "", "", 0, 0),
+        ('arrivalPos="max"', "", "", 0, 0),
+    ],
+    ids=["parks", "stops", "parks beyond", "ends on the lane", "ends at the line"],
+)
+def test_only_who_comes_past_the_end_of_a_road_at_a_light_has_left(
+    attributes: str, end: str, stop: str, first_s: int, last_s: int,
+    simulator: LibsumoSimulator, tmp_path: Path,
+) -> None:  # fmt: skip
+    car = f'<vehicle id="0" depart="0" {attributes}><route edges="Ww wM {end}"/>{stop}</vehicle>'
+    scenario = crossroads_with(car, tmp_path, 100, 120)
+    network = Network.read(scenario)
+    (light,) = network.intersections
+    green = "".join("G" if link.from_edge == "wM" else "r" for link in light.links)
+    lanes = network.lane_table().ids
+    simulator.start(launch_of(scenario, 1, tmp_path / "own", lanes, crossings=True))
+    place = lanes.index("wM_0")
+    left = [simulator.advance(1, {"M": [(1.0, green)]}).mean_left[place] for _ in range(110)]
+    assert sum(left) == sum(left[first_s:last_s]) == (last_s > 0)
+
+
 @pytest.mark.parametrize("measured", ["_0", "_1", ""])
 def test_on_many_lanes_it_is_who_is_on_another_road_a_second_later(
     measured: str, simulator: LibsumoSimulator, tmp_path: Path

@@ -19,7 +19,8 @@ _FASTEST = 2.0
 class Crossings:
     """Vehicles of a running simulation that leave a lane's road, from one look to the next.
 
-    A vehicle that was on a lane and is not on its road any more has left. Between two looks, a
+    A vehicle that was on a lane and is not on its road any more has left. Whoever parks beside the
+    road has not. Nor has whoever ends a trip on a road at a light. Between two looks, a
     vehicle can cross a short lane without being seen on it. Such vehicles are found on the lanes
     beyond: inside the junction, or on the next road.
 
@@ -32,6 +33,11 @@ class Crossings:
         self._api = api
         self._lanes = lanes
         self._on: list[tuple[str, ...]] = []
+        self._at_lights = {
+            edge_of_lane(lane)
+            for light in api.trafficlight.getIDList()
+            for lane in api.trafficlight.getControlledLanes(light)
+        }
         short = {
             edge_of_lane(lane)
             for lane in lanes
@@ -51,9 +57,7 @@ class Crossings:
             if earlier != later:  # the same in most seconds
                 gone.update(dict.fromkeys(set(earlier).difference(later), index))
         for name, index in gone.items():
-            road = edge_of_lane(self._lanes[index])
-            if name not in api.edge.getLastStepVehicleIDs(road):
-                left[index] += 1.0
+            left[index] += self._has_left(name, edge_of_lane(self._lanes[index]))
         for road, beyond in self._beyond.items():
             earlier = self._near.get(road, set())
             near = set(api.edge.getLastStepVehicleIDs(road))
@@ -66,6 +70,14 @@ class Crossings:
             # whoever parks beside the next road comes back to it
             near.update(name for name in earlier - near if self._comes_from(name, road))
             self._near[road] = near
+
+    def _has_left(self, name: str, road: str) -> bool:
+        """Return True if a vehicle that was on a road has left it, and not only its lane."""
+        try:
+            where: str = self._api.vehicle.getRoadID(name)  # of one that parks, the road beside it
+        except self._api.TraCIException:  # it has left the simulation
+            return road not in self._at_lights
+        return where != road
 
     def _comes_from(self, name: str, road: str) -> bool:
         """Return True if a vehicle came by a road to the junction after it, or to the next road."""
