@@ -109,6 +109,24 @@ def test_a_part_of_a_second_counts_as_a_part(
     assert later.tolist() == [0, 0, 0, 0]
 
 
+@pytest.mark.parametrize("step_s", [0.1, 0.4, 2.0, 5.0])
+def test_seconds_within_a_step_of_the_simulation_are_as_the_last_step_left_them(
+    step_s: float, simulator: LibsumoSimulator, start: Any
+) -> None:
+    start(ONE_WAITS, crossings=False, step_s=step_s)
+    simulator.advance(10, {"C": [(10.0, "Gr")]})
+    steps = round(10 / step_s)
+    there = [1.0]
+    there += [
+        simulator.advance(step_s, {"C": [(step_s, "rG")]}).vehicles[WEST] for _ in range(steps)
+    ]
+    gone = [1 - there[int(second / step_s + 1e-6)] for second in range(1, 11)]
+    start(ONE_WAITS, step_s=step_s)
+    simulator.advance(10, {"C": [(10.0, "Gr")]})
+    found = simulator.advance(10, {"C": [(10.0, "rG")]}).mean_left[WEST]
+    assert found == pytest.approx(np.mean(gone)) and 0 < found < 1
+
+
 def test_several_vehicles_add_up_as_counts_by_the_second_do(
     simulator: LibsumoSimulator, start: Any
 ) -> None:

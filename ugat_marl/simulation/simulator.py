@@ -7,6 +7,7 @@ process.
 
 from __future__ import annotations
 
+import math
 import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -131,12 +132,15 @@ class LibsumoSimulator:
         if self._crossings is not None:
             ends = seconds_of(seconds)
             widths = dict(zip(ends.tolist(), np.diff(ends, prepend=0.0).tolist(), strict=True))
+        step_s = libsumo.simulation.getDeltaT()
         left = np.zeros(len(self._launch.lanes))
         mean_left = left.copy()
         try:
             for offset in sorted({*changes, *widths}):
-                if offset > 0:
-                    libsumo.simulation.step(begin + offset)
+                # within a step nobody has moved yet, and SUMO would go on to its end
+                steps = math.floor(round(offset / step_s, 6))
+                if steps > 0:
+                    libsumo.simulation.step(begin + steps * step_s)
                 if self._crossings is not None and offset in widths:
                     self._crossings.add_to(left)
                     mean_left += left * widths[offset] / seconds
