@@ -31,6 +31,7 @@ from ugat_marl.errors import (
     SimulatorError,
     WorkerError,
 )
+from ugat_marl.scenarios import MEMORY_VARIABLE
 from ugat_marl.simulation import (
     Channel,
     ChannelClosed,
@@ -718,3 +719,19 @@ def test_workers_import_what_their_user_imports() -> None:
     assert environment["OF_A_SERVICE"] == "1" and environment["PATH"] == os.environ["PATH"]
     assert environment["PYTHONPATH"].split(os.pathsep) == [p or str(Path.cwd()) for p in sys.path]
     assert environment["PYTHONSAFEPATH"] == "1"
+
+
+def test_the_limit_of_memory_holds_though_another_environment_is_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Processes are forked from a parent that started before the variable was set."""
+    monkeypatch.delenv(MEMORY_VARIABLE, raising=False)
+    first, second = (parallel_env("single-v1", duration_s=20) for _ in range(2))
+    first.reset(seed=1)
+    monkeypatch.setenv(MEMORY_VARIABLE, "0.05")
+    with pytest.raises(SimulatorError, match=r"more memory than a simulation may use \(0\.05 GB\)"):
+        second.reset(seed=1)
+    monkeypatch.delenv(MEMORY_VARIABLE)
+    second.reset(seed=1)
+    first.close()
+    second.close()

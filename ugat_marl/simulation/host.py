@@ -146,6 +146,8 @@ class Host:
         Raises:
             SimulatorCrashed: No process can be started.
         """
+        # a warm parent has the variables of the time at which it started
+        order = {**order, "memory": os.environ.get(MEMORY_VARIABLE, "")}
         if self._method == "spawn":
             return Worker.spawn(self._service, order, self._defaults, self._deadline_s)
         for _ in range(2):

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ugat_marl.errors import SimulatorError, UgatMarlError
+from ugat_marl.scenarios import MEMORY_VARIABLE
 from ugat_marl.simulation.channel import Channel, ChannelClosed, Message
 from ugat_marl.simulation.host import LENGTH, too_much_memory
 
@@ -132,6 +133,7 @@ def _work(
 ) -> NoReturn:
     """Answer questions until the connection closes, then exit."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ[MEMORY_VARIABLE] = order["memory"]
     life = _Life(parent, user, order.get("directory"), guard)
     answer = service.open(order, descriptors)
     with contextlib.suppress(ChannelClosed, OSError):
