@@ -827,6 +827,11 @@ def test_wrong_calls(crossing: Crossing) -> None:
             vector_env(directory, 2, **options)
     with pytest.raises(OptionError, match="at least one domain"):
         in_turn([])
+    with pytest.raises(OptionError, match=r"in_turn\(None\): give a list of domains"):
+        in_turn(None)  # type: ignore[arg-type]
+    effects = [StartupDelay(1.0)]
+    for one in ("V1", effects):  # a list of effects is one domain
+        assert [in_turn(one)(environment, 1) for environment in range(3)] == [one] * 3
     numbers: dict[str, Any] = {"neighbours": np.int64(0), "duration_s": np.float32(20)}
     with vector_env(directory, 1, **numbers) as env:
         assert env.reset(1).observations.shape[0] == 1

@@ -36,12 +36,13 @@ DEATHS = 3
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode; ``reset(seed=seed)`` of `parallel_env` in the domain repeats it.
+    """An episode; ``reset(seed=seed)`` of `parallel_env` in its domain repeats it.
 
     Attributes:
         number: Number of earlier episodes of the environment since it was given a seed.
         seed: Seed of traffic and simulation.
-        domain: Name of the domain.
+        domain: Name of the domain. For a list of effects it holds their numbers to 12 digits; only
+            the list itself repeats the episode exactly.
     """
 
     number: int

@@ -234,19 +234,22 @@ def domain_chooser(
     return lambda environment, episode: listed[environment]
 
 
-def in_turn(domains: Sequence[Domain]) -> DomainOf:
+def in_turn(domains: Domain | Sequence[Domain]) -> DomainOf:
     """Return a domain randomisation in which each environment goes through a list.
 
     Episode ``k`` of environment ``i`` is in domain ``(i + k) mod len(domains)``, for any number of
     environments.
 
     Args:
-        domains: List of at least one domain.
+        domains: List of at least one domain; one domain stands for a list of it.
 
     Raises:
-        OptionError: The list is empty.
+        OptionError: The list is empty, or it is no list.
     """
-    listed = list(domains)
+    given: Any = domains
+    if not isinstance(given, Sequence):
+        raise OptionError(f"in_turn({given!r}): give a list of domains")
+    listed: list[Any] = [given] if given and is_one_domain(given) else list(given)
     if not listed:
         raise OptionError("in_turn() needs at least one domain")
     return lambda environment, episode: listed[(environment + episode) % len(listed)]
