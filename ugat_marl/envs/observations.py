@@ -87,11 +87,13 @@ class Observer:
         self.commands = commands
         self._lanes = network.lane_table()
         items = network.intersections
-        self._incoming = np.concatenate(
-            [self._lanes.indices(intersection.incoming_lanes) for intersection in items]
-        )
+        columns = [self._lanes.indices(intersection.incoming_lanes) for intersection in items]
+        self._incoming = np.concatenate(columns)
         self._downstream = _downstream_matrix(network) if name == "pressure" else None
-        self._gather, sizes = _gather(network, name)
+        if name == "movements":
+            columns = _movement_positions(network)
+            self._movements = np.concatenate(columns)
+        sizes = [len(column) for column in columns]
         if self._function is not None:
             self._views = IntersectionViews(network)
             idle = Snapshot.idle(len(self._lanes.ids))
@@ -226,7 +228,7 @@ class Observer:
             return np.clip(filled[self._incoming] - self._downstream @ filled, -1.0, 1.0)
         else:
             both = np.concatenate((snapshot.halting / capacity, snapshot.vehicles / capacity))
-            values = both[self._gather]
+            values = both[self._movements]
         return np.minimum(values, 1.0)
 
     def _features(self, view: IntersectionView) -> NDArray[np.float32]:
@@ -275,33 +277,22 @@ def _feature_names(item: Intersection, name: str, size: int) -> list[tuple[str, 
 
 
 def joint_space(spaces: Sequence[Box]) -> Box:
-    """Return the space of concatenated vectors."""
+    """Return the space of concatenated vectors, with the dtype of the first space."""
     low = np.concatenate([space.low for space in spaces])
     high = np.concatenate([space.high for space in spaces])
-    return Box(low, high, dtype=np.float32)
+    return Box(low, high, dtype=spaces[0].low.dtype.type)
 
 
-def _gather(network: Network, name: str) -> tuple[NDArray[np.int64], list[int]]:
-    """Return the positions of all features, and the number of features of each intersection.
-
-    For `movements` they are positions in (halting | vehicles), otherwise indices of lanes.
-    """
+def _movement_positions(network: Network) -> list[NDArray[np.int64]]:
+    """Return the positions of each intersection's `movements` in (halting | vehicles)."""
     lanes = network.lane_table()
     count = len(lanes.ids)
-    parts: list[NDArray[np.int64]] = []
-    sizes: list[int] = []
+    positions: list[NDArray[np.int64]] = []
     for intersection in network.intersections:
-        incoming, outgoing = (
-            lanes.indices(intersection.incoming_lanes),
-            lanes.indices(intersection.outgoing_lanes),
-        )
-        if name == "movements":
-            columns = np.concatenate((incoming, incoming + count, outgoing + count))
-        else:
-            columns = incoming
-        parts.append(columns)
-        sizes.append(len(columns))
-    return np.concatenate(parts), sizes
+        incoming = lanes.indices(intersection.incoming_lanes)
+        outgoing = lanes.indices(intersection.outgoing_lanes)
+        positions.append(np.concatenate((incoming, incoming + count, outgoing + count)))
+    return positions
 
 
 def _downstream_matrix(network: Network) -> NDArray[np.float64]:

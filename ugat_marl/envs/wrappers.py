@@ -23,6 +23,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from ugat_marl.envs.actions import checked_phases, is_phase, require_mapping
 from ugat_marl.envs.agents import discrete_actions, vector_box
+from ugat_marl.envs.observations import joint_space
 from ugat_marl.envs.options import is_count
 from ugat_marl.envs.types import AnyParallelEnv, ResetResult, StepResult
 from ugat_marl.errors import ActionError, EpisodeError, OptionError, UgatMarlError
@@ -286,7 +287,7 @@ class _AgentIndicator(Wrapper):
         super().__init__(env)
         agents = list(self.observation_spaces)
         one_hot = spaces.Box(0.0, 1.0, (len(agents),), np.float32)
-        extended = _each(self.observation_spaces, lambda box: _joined([box, one_hot]))
+        extended = _each(self.observation_spaces, lambda box: joint_space([box, one_hot]))
         self.observation_spaces = extended
         self._row = {agent: row for row, agent in enumerate(agents)}
 
@@ -302,7 +303,7 @@ class _SharedObservation(Wrapper):
     def __init__(self, env: AnyParallelEnv) -> None:
         super().__init__(env)
         every = list(self.observation_spaces.values())
-        extended = _each(self.observation_spaces, lambda box: _joined([box, *every]))
+        extended = _each(self.observation_spaces, lambda box: joint_space([box, *every]))
         self.observation_spaces = extended
 
     def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
@@ -332,7 +333,7 @@ class _FrameStack(Wrapper):
     def _stacked_box(self, box: spaces.Box) -> spaces.Box:
         """Return the box of k frames; all but the newest may also be zeros."""
         zeros = spaces.Box(np.minimum(box.low, 0), np.maximum(box.high, 0), dtype=_dtype(box))
-        return _joined([*[zeros] * (self.frames - 1), box])
+        return joint_space([*[zeros] * (self.frames - 1), box])
 
     def _begin(self) -> None:
         self._frames.clear()
@@ -364,7 +365,7 @@ class _AppendedMask(_Masking):
         made: dict[tuple[int, int], spaces.Box] = {}  # agents that shared a box still do
         for agent, box in self.observation_spaces.items():
             key = id(box), self._sizes[agent]
-            made[key] = made.get(key) or _joined([box, masks[key[1]]])
+            made[key] = made.get(key) or joint_space([box, masks[key[1]]])
             self.observation_spaces[agent] = made[key]
 
     def _seen(self, observations: Vectors, infos: Infos) -> dict[str, Any]:
@@ -564,12 +565,6 @@ def _size(space: spaces.Discrete) -> int:
 def _dtype(box: spaces.Box) -> Any:
     assert box.dtype is not None
     return box.dtype.type
-
-
-def _joined(boxes: list[spaces.Box]) -> spaces.Box:
-    """Return the box of concatenated vectors, with the dtype of the first box."""
-    low, high = ([getattr(box, side) for box in boxes] for side in ("low", "high"))
-    return spaces.Box(np.concatenate(low), np.concatenate(high), dtype=_dtype(boxes[0]))
 
 
 def _each(boxes: Mapping[str, spaces.Box], change: Any) -> dict[str, spaces.Box]:
