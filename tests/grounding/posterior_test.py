@@ -87,6 +87,22 @@ def test_a_lane_without_data_follows_the_network_and_is_less_certain() -> None:
     middle = sample_s.mean(0)
     assert middle[2, 0] == pytest.approx(np.delete(middle[:, 0], 2).mean(), abs=0.8)
     assert middle[2, 0] > 1.0  # not zero
+    spread = sample_s.std(0)[:, 0]
+    assert spread[2] > 1.5 * np.delete(spread, 2).mean()
+
+
+def test_a_lane_without_data_in_all_worlds_is_given_no_green_of_its_own() -> None:
+    """Greens of one lane serve a vehicle less, in worlds and on the street; none is unused."""
+
+    def shaped(values: WorldValues, seed: int, silent: int | None = None) -> Summary:
+        told = summary(values, seed, silent)
+        told.values[2, 7] -= 1.0
+        return told
+
+    truth = WorldValues(np.array([x.nominal for x in WORLDS.library]), np.zeros((len(LANES), 2)))
+    simulated = [SimulatedLog(values, shaped(values, k, 2)) for k, values in enumerate(LEARNT_FROM)]
+    found = Posterior.fit(WORLDS, simulated, shaped(truth, 5)).sample(200)[1].mean(0)
+    assert found[:, 0].max() < 0.3
 
 
 def test_draws_keep_to_their_ranges_and_name_only_what_changes() -> None:

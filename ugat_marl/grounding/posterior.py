@@ -311,16 +311,18 @@ class Posterior:
     ) -> Posterior:
         """Fit the regression to simulated worlds and apply it to the street.
 
+        What the street or all worlds lack at a lane is left out in both.
+
         Args:
             worlds: The prior.
             simulated: Simulated worlds, more than values that are estimated for the network and 1.
             street: Statistics of the street's log.
         """
-        simulated = [replace(item, summary=item.summary.where(street.usable)) for item in simulated]
         number, lanes = len(simulated), len(worlds.lanes)
-        unknown = np.isnan(street.network)  # a statistic that the street's log does not have
-        network = np.stack([item.summary.network for item in simulated])
-        network[:, unknown] = np.nan
+        in_worlds = np.any([~np.isnan(item.summary.values) for item in simulated], axis=0)
+        known = in_worlds & ~np.isnan(street.values)
+        street, *summaries = (s.where(known) for s in (street, *(w.summary for w in simulated)))
+        network = np.stack([summary.network for summary in summaries])
         design = Design.of(network)
         x, x_street = design.inputs(network), design.inputs(street.network[None])
         effects = worlds.scaled(np.stack([item.values.effects for item in simulated]))
@@ -332,8 +334,7 @@ class Posterior:
         errors = wanted - predicted
 
         # Lanes: their distance from the network's mean, from that of their statistics.
-        unlike = np.stack([s.summary.values - s.summary.network for s in simulated])
-        unlike[:, :, unknown] = np.nan
+        unlike = np.stack([summary.values - summary.network for summary in summaries])
         usual = np.stack([_mean(unlike[:, lane]) for lane in range(lanes)])
         rows = (unlike - usual).reshape(number * lanes, -1)
         own = Design.of(rows)

@@ -70,24 +70,19 @@ class Summary:
     Attributes:
         values: ``(lanes, len(NAMES))``, vehicles; NaN where too few decisions are of the kind.
         rows: Decisions behind each value, ``(lanes, len(NAMES))``.
-        usable: True for values that may be used, bool ``(lanes, len(NAMES))``; None for all.
     """
 
     values: Floats
     rows: Floats
-    usable: NDArray[np.bool_] | None = None
 
     @classmethod
     def of(cls, values: Floats, rows: Floats) -> Summary:
         """Return a summary in which values of too few decisions are NaN."""
         return cls(np.where(rows < LEAST_ROWS, np.nan, values), rows)
 
-    def where(self, usable: NDArray[np.bool_] | None) -> Summary:
-        """Return the summary without values that may not be used; None leaves it as it is."""
-        if usable is None:
-            return self
-        values, rows = np.where(usable, self.values, np.nan), np.where(usable, self.rows, 0.0)
-        return Summary(values, rows, usable)
+    def where(self, usable: NDArray[np.bool_]) -> Summary:
+        """Return the summary without values that may not be used, ``(lanes, len(NAMES))``."""
+        return Summary(np.where(usable, self.values, np.nan), np.where(usable, self.rows, 0.0))
 
     @property
     def network(self) -> Floats:
