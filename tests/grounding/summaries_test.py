@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -70,7 +72,7 @@ def test_a_missing_decision_makes_no_green_older(
     assert fall(log, "is long") == pytest.approx(is_long)
 
 
-def rows_of(counts: list[float], served: list[float]) -> LaneRows:
+def rows_of(counts: list[float], served: list[float], view: LaneView = VIEW) -> LaneRows:
     """Return the decisions of a lane in green, whose counts follow each other."""
     layouts = {"a_0": AgentLayout(1, 2)}
     recorder = TransitionRecorder(Provenance("by hand", "", "street", (), 10.0, "count", layouts))
@@ -79,7 +81,7 @@ def rows_of(counts: list[float], served: list[float]) -> LaneRows:
         stays = {"a_0": np.array([(counts[t] - left) / 40.0])}
         ran = {"a_0": 0}
         recorder.record(0, t, seen[t], ran, ran, {"a_0": 0.0}, seen[t + 1], served=stays)
-    (rows,) = VIEW.rows(recorder.log())
+    (rows,) = view.rows(recorder.log())
     return rows
 
 
@@ -92,6 +94,20 @@ def test_vehicles_that_left_are_counted_without_those_that_came() -> None:
 def test_a_lane_is_full_if_it_is_so_before_or_after_a_decision() -> None:
     """It holds 40 vehicles, and is full from 36 on."""
     assert rows_of([35.0, 36.0, 30.0, 30.0], served=[0.0] * 3).full.tolist() == [True, True, False]
+
+
+def test_a_short_lane_is_never_full() -> None:
+    """A single vehicle fills most of it, and is no jam."""
+    counts, served = [0.0, 1.0, 3.0, 2.0], [0.0] * 3
+    for holds, expected in ((2.9, [False] * 3), (3.0, [False, True, True])):
+        rows = rows_of(counts, served, replace(VIEW, holds=np.array([holds])))
+        assert rows.full.tolist() == expected
+
+
+def test_a_lane_without_a_decision_has_no_statistics() -> None:
+    log = log_of(10.0)
+    summary = VIEW.summary(TransitionLog(log.provenance, log.frame.clear()))
+    assert np.isnan(summary.values).all() and not summary.rows.any()
 
 
 def test_the_network_s_mean_counts_decisions_and_not_lanes() -> None:

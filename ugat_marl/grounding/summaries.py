@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.data import AgentLayout, TransitionLog, Transitions, consecutive
+from ugat_marl.data import TransitionLog, consecutive
 from ugat_marl.envs import COUNT_SCALE
 from ugat_marl.errors import OptionError
 from ugat_marl.scenarios import GREEN, Intersection, Network
@@ -29,8 +29,8 @@ FULL = 0.9
 """Share of the vehicles that fit on a lane from which it is full. At 0.8 long queues that still
 move are taken for full; at 1.0 trucks and gaps keep a jam from being seen."""
 LEAST_HOLDS = 3.0
-"""Fewest vehicles that a lane behind an intersection holds for it to be called full. In a shorter
-one, as between two nodes of a map, a single vehicle that passes looks like a jam."""
+"""Fewest vehicles that a lane holds for it to be called full. In a shorter one, as between two
+nodes of a map, a single vehicle that passes or stops looks like a jam."""
 MOST_DEVIATION = 1.5
 """Standard deviation of the vehicles on a lane, in vehicles, above which only the service of its
 greens is used: the fall of a queue by two or three vehicles would be lost in it. At 3.0 lanes are
@@ -211,36 +211,24 @@ class LaneView:
 
     def rows(self, log: TransitionLog) -> list[LaneRows]:
         """Return the decisions of every lane, in the order of `lanes`."""
+        limits = np.where(self.holds < LEAST_HOLDS, np.inf, FULL * self.holds)
         rows = [
             row
-            for place, (agent, layout) in enumerate(log.provenance.layouts.items())
-            for row in self._rows_of(
-                place, log.transitions(agent), layout, log.provenance.decision_interval_s
-            )
+            for place, (agent, lanes) in enumerate(self.lanes_of(log.agents).items())
+            for row in self._rows_of(place, log, agent, limits[lanes.start : lanes.stop])
         ]
-        limits = FULL * self.holds
-        full = [
-            (row.before >= limit) | (row.after >= limit)
-            for row, limit in zip(rows, limits, strict=True)
-        ]
-        jams = [row.key[jam] for row, jam in zip(rows, full, strict=True)]
+        jams = [row.key[row.full] for row in rows]
         return [
-            replace(
-                row,
-                full=jam,
-                held=row.held | np.isin(row.key, np.concatenate([jams[k] for k in ways]))
-                if ways
-                else row.held,
-            )
-            for row, jam, ways in zip(rows, full, self.onward, strict=True)
+            replace(row, held=row.held | np.isin(row.key, np.concatenate([jams[k] for k in ways])))
+            if ways
+            else row
+            for row, ways in zip(rows, self.onward, strict=True)
         ]
 
     def summary(self, log: TransitionLog) -> Summary:
         """Return the statistics of a log."""
-        parts = [_statistics(row) for row in self.rows(log)]
-        summary = Summary(
-            np.stack([values for values, _ in parts]), np.stack([number for _, number in parts])
-        )
+        values, numbers = zip(*map(_statistics, self.rows(log)), strict=True)
+        summary = Summary.of(np.stack(values), np.stack(numbers))
         deviation = log.provenance.deviation
         if not deviation:
             return summary
@@ -248,9 +236,13 @@ class LaneView:
         return summary.where(~(unsure[:, None] & OF_COUNTS))
 
     def _rows_of(
-        self, place: int, rows: Transitions, layout: AgentLayout, interval_s: float
+        self, place: int, log: TransitionLog, agent: str, limits: Floats
     ) -> Iterator[LaneRows]:
-        """Return the decisions of the lanes of an intersection."""
+        """Return the decisions of the lanes of an intersection; at `limits` vehicles they are full.
+
+        Jams that `onward` leads to are not yet among those that hold a lane.
+        """
+        rows, layout = log.transitions(agent), log.provenance.layouts[agent]
         green, scale, first = self.green[place], self.scale[place], self.first[place]
         part = slice(first, first + len(scale))
         before = rows.observation[:, part].astype(np.float64) * scale
@@ -260,8 +252,10 @@ class LaneView:
             left = before - rows.served_features[:, part] * scale
         phase = rows.observation[:, layout.features : layout.features + layout.phases].argmax(1)
         had, has = green[:, phase], green[:, rows.executed]
-        age_s = interval_s * _ages(had, consecutive(rows.episode, rows.step))
-        none = np.zeros(len(before), dtype=np.bool_)
+        follows = consecutive(rows.episode, rows.step)
+        age_s = log.provenance.decision_interval_s * _ages(had, follows)
+        before, after = _whole(before), _whole(after)
+        full = np.maximum(before, after) >= limits
         held = np.zeros(before.shape, dtype=np.bool_)
         for feature, ways in self.beyond[place] if self.beyond else ():
             filled = np.maximum(rows.observation[:, feature], rows.next_observation[:, feature])
@@ -270,12 +264,12 @@ class LaneView:
             yield LaneRows(
                 rows.episode,
                 rows.step,
-                _whole(before[:, k]),
-                _whole(after[:, k]),
+                before[:, k],
+                after[:, k],
                 left[:, k],
                 age_s[k],
                 has[k],
-                none,
+                full[:, k],
                 held[:, k],
             )
 
@@ -301,7 +295,7 @@ def _whole(counts: Floats) -> Floats:
 
 
 def _statistics(rows: LaneRows) -> tuple[Floats, Floats]:
-    """Return the statistics of a lane, and the numbers of decisions behind them."""
+    """Return the statistics of a lane, and the numbers of decisions behind them; NaN for none."""
     before, fall = rows.before, rows.before - rows.after
     goes_on, is_long = rows.has & rows.had, rows.age_s >= LONG_S
     greens = (rows.has & ~rows.had, goes_on & ~is_long, goes_on & is_long)
@@ -314,14 +308,16 @@ def _statistics(rows: LaneRows) -> tuple[Floats, Floats]:
     ]
     cells.append((-fall, ~rows.has & ~rows.had & ~rows.full))
     means, counts = zip(*(_mean(outcome, use) for outcome, use in cells), strict=True)
-    whole = (before.mean(), before.std(), np.quantile(before, 0.99))
+    whole = [np.nan] * 3
+    if len(before):
+        whole = [before.mean(), before.std(), np.quantile(before, 0.99)]
     return np.array([*means, *whole]), np.array([*counts, *[float(len(before))] * len(whole)])
 
 
 def _mean(outcome: Floats, use: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return the mean of the used decisions, and their number; NaN for too few."""
+    """Return the mean of the used decisions, and their number; NaN for none."""
     rows = outcome[use & ~np.isnan(outcome)]
-    return float(rows.mean()) if len(rows) >= LEAST_ROWS else np.nan, float(len(rows))
+    return float(rows.mean()) if len(rows) else np.nan, float(len(rows))
 
 
 def _onward(network: Network, lanes: Sequence[str]) -> tuple[tuple[int, ...], ...]:
