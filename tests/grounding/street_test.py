@@ -366,10 +366,15 @@ def test_unknown_parts_and_too_few_simulations_are_refused() -> None:
         OptionError, match="parts is 'eyes'; allowed: a list, of which each is a text"
     ):
         StreetConfig(parts="eyes")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(OptionError, match="at least 20"):
-        StreetConfig(simulations=3)
-    with pytest.raises(OptionError, match="simulated_s = nan: must be above 0"):
-        StreetConfig(simulated_s=float("nan"))
+    for wrong, told in (
+        ({"simulations": 3}, "street simulations is 3; allowed: >= 20"),
+        ({"further": -1}, "street further is -1; allowed: >= 0"),
+        ({"judged": -1}, "street judged is -1; allowed: >= 0"),
+        ({"simulated_s": float("nan")}, "street simulated_s is nan; allowed: > 0, finite"),
+        ({"simulated_s": float("inf")}, "street simulated_s is inf; allowed: > 0, finite"),
+    ):
+        with pytest.raises(OptionError, match=told):
+            StreetConfig(**wrong)
     for wrong, told in (
         ({"most_lag": -1}, "most_lag is -1"),
         ({"most_lag": 2.5}, "most_lag is 2.5; allowed: a whole number"),
@@ -543,7 +548,7 @@ def test_a_rule_that_is_better_in_the_fitted_street_is_kept(
 
 def test_so_few_episodes_of_a_rule_are_refused() -> None:
     for budget in (-1, 1):
-        with pytest.raises(OptionError, match="at least 2, or 0"):
+        with pytest.raises(OptionError, match="rule_budget is .*; allowed: >= 2, or 0"):
             StreetConfig(rule_budget=budget)
 
 

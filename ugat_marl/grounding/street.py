@@ -41,7 +41,7 @@ from ugat_marl.errors import (
     ScenarioError,
     UnknownNameError,
     require_kinds,
-    require_least,
+    require_ranges,
 )
 from ugat_marl.files import MALFORMED
 from ugat_marl.grounding.channel import (
@@ -105,11 +105,12 @@ class StreetConfig:
         simulations: N, worlds that are simulated for the first fit: six in ten from the prior,
             the others near the street, by a fit to these.
         further: Worlds that each further iteration adds, half of them drawn from the posterior.
-        simulated_s: Length of an episode in such a world, in s, at least `LEAST_DECISIONS`. Of
-            longer episodes of the street only this first part is compared. Detectors are compared
-            over whole episodes.
-        judged: Most worlds of the fitted street in which policies race after each iteration
-            (`policy_race.race_policies`); the best one is kept. 0 keeps the last one.
+        simulated_s: Length of an episode in such a world, in s; at least 30 decisions are always
+            simulated. Of longer episodes of the street only this first part is compared. Detectors
+            are compared over whole episodes.
+        judged: Most worlds of the fitted street in which policies race after each iteration. All
+            play in eight worlds, and those that are clearly slower leave before the next eight; the
+            best one is kept. 0 keeps the last one.
         rule_budget: Budget that decides how many settings of each rule race in worlds of the fitted
             street. The best rule of all teaches the learner, and is kept if it is better than the
             trained policies. With 0 only trained policies are kept. None stands for 6 with a
@@ -148,17 +149,12 @@ class StreetConfig:
         for effect in self.without:
             if effect not in library:
                 raise UnknownNameError("effect of the library", effect, library)
-        require_least(20, **{"street.simulations": self.simulations})
-        if self.further < 0:
-            raise OptionError(f"further = {self.further}: must not be negative")
-        if self.judged < 0:
-            raise OptionError(f"judged = {self.judged}: must not be negative")
+        least = {"simulations": 20, "further": 0, "judged": 0}
+        require_ranges(self, "street", at_least=least, positive=("simulated_s",))
         if self.rule_budget is not None and (self.rule_budget < 0 or self.rule_budget == 1):
             raise OptionError(
-                f"rule_budget = {self.rule_budget}: must be at least 2, or 0 for no rules"
+                f"street rule_budget is {self.rule_budget}; allowed: >= 2, or 0 for no rules"
             )
-        if not self.simulated_s > 0:  # not a number either
-            raise OptionError(f"simulated_s = {self.simulated_s}: must be above 0")
 
     def budget_of_rules(self, *, taught: bool) -> int:
         """Return the budget of the race of rules, or 0 without one.
