@@ -668,6 +668,30 @@ def test_detectors_are_compared_over_equally_long_logs(monkeypatch: pytest.Monke
         assert seen[-2:] == [decisions, decisions]
 
 
+def test_detectors_are_compared_over_hours_that_the_simulation_plays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of a period from 100 s to 300 s only the decisions before 200 s, the end of an episode."""
+    seen: list[int] = []
+
+    def fit(real: TransitionLog, simulated: TransitionLog, *_: object) -> Eyes:
+        seen.extend(real.frame.group_by("episode", maintain_order=True).len()["len"].to_list())
+        return fit_eyes(real, simulated, view)
+
+    monkeypatch.setattr("ugat_marl.grounding.street.fit_eyes", fit)
+    config = replace(QUICK, parts=("eyes",))
+    env = parallel_env(SCENARIO)
+    prior, view = street_prior(env, config), LaneView.of(env.network, "count")
+    env.close()
+    whole = recorded("sim", 300)
+    log = TransitionLog.concatenate([whole.first(20), whole])
+    late = (pl.col("episode") < 1) | (pl.col("step") >= 10)
+    log = TransitionLog(replace(log.provenance, from_begin=True), log.frame.filter(late))
+    replay = RecordedCommands(log, longest=20)
+    fit_street(log.from_step_0(), simulation(200.0), replay, prior, view, config, seed=0)
+    assert seen == [20, 10]
+
+
 @pytest.mark.slow
 def test_a_learner_begins_anew_when_late_commands_are_found_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

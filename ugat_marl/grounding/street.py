@@ -530,16 +530,16 @@ def fit_street(
     held_s = timing.clearance_s + timing.min_green_s
     channel = fit_channel(real, config.channel, held_s) if "channel" in config.parts else None
     street = FittedStreet(lanes, interval_s, channel)
-    if "eyes" in config.parts:
-        eyes = _eyes(real, simulation, policy, street, view, config.eyes, seed, on_done)
-        street = replace(street, eyes=eyes)
-    if not config.simulates:
-        return street, history
     longest = max(1, int(simulation.longest_s / interval_s + 1e-9))
-    require_room(policy, longest)
     reached = real.first(longest)
     if isinstance(policy, RecordedCommands):
         reached = policy.within(real, longest)
+    if "eyes" in config.parts:
+        eyes = _eyes(reached, simulation, policy, street, view, config.eyes, seed, on_done)
+        street = replace(street, eyes=eyes)
+    if not config.simulates:
+        return street, history
+    require_room(policy, longest)
     # Queues grow through a peak: worlds of half an hour tell nothing of an hour's second half.
     wanted = max(int(config.simulated_s / interval_s), LEAST_DECISIONS)
     decisions = min(wanted, reached.decisions)
