@@ -326,6 +326,15 @@ def test_a_late_period_shortens_the_comparison_of_no_other(
     assert sorted({length for (length,) in compared[1:]}) == [10, 40]
 
 
+def test_a_street_is_compared_without_decisions_that_its_log_never_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nine of forty decisions are missing; simulated queues of these do not count either."""
+    log = in_part(recorded("sim", 400.0), ~pl.col("step").is_between(1, 9))
+    compared = lengths_compared(log, 400.0, monkeypatch)
+    assert {length for (length,) in compared} == {31}
+
+
 def test_a_log_whose_end_is_all_that_an_episode_reaches_is_refused_before_training(
     tmp_path: Path,
 ) -> None:

@@ -543,7 +543,8 @@ def fit_street(
     # Queues grow through a peak: worlds of half an hour tell nothing of an hour's second half.
     wanted = max(int(config.simulated_s / interval_s), LEAST_DECISIONS)
     decisions = min(wanted, reached.decisions)
-    seen = view.summary(reached.first(decisions))
+    begun = reached.first(decisions)
+    seen = view.summary(begun)
     simulated, posterior = list(history.simulated), history.posterior
     for prior, aimed in history.rounds(config):
         first, number = len(simulated) - len(history.simulated), prior + aimed
@@ -555,11 +556,21 @@ def fit_street(
         drawn = [street.around(worlds, *pair) for pair in zip(values, seeds, strict=True)]
         logs = simulation.logs(drawn, policy, seeds, decisions * interval_s, on_done)
         simulated += [
-            SimulatedLog(*pair) for pair in zip(values, map(view.summary, logs), strict=True)
+            SimulatedLog(one, view.summary(_as_recorded(log, begun)))
+            for one, log in zip(values, logs, strict=True)
         ]
         posterior = Posterior.fit(worlds, simulated, seen)
     street = FittedStreet(lanes, interval_s, channel, street.eyes, posterior)
     return street, FitHistory(tuple(simulated), posterior)
+
+
+def _as_recorded(simulated: TransitionLog, street: TransitionLog) -> TransitionLog:
+    """Return a simulated log without decisions of an agent that no episode of the street has.
+
+    A light whose log begins late would else be compared with queues of a begin that it lacks.
+    """
+    rows = simulated.frame.join(street.frame, on=("agent", "step"), how="semi")
+    return TransitionLog(simulated.provenance, rows)
 
 
 def _eyes(
