@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
 from ugat_marl.grounding.posterior import ServicePrior
-from ugat_marl.grounding.presence import LEAST_SPREAD, Presence, lanes_differ
+from ugat_marl.grounding.presence import LEAST_SPREAD, SPREADS_TRIED, Presence, lanes_differ
 from ugat_marl.grounding.regression import Calibration
 
 ENDS = (np.zeros(2), np.full(2, -3.0), np.full(2, 5.0))
@@ -96,6 +96,25 @@ def test_lanes_that_differ_are_seen() -> None:
     one_is_slow = near + np.eye(12)[3] * 3.0
     assert lanes_differ(one_is_slow, spread, 2.5) > 5.0
     assert lanes_differ(np.zeros(1), np.full(1, 0.01), 2.5) == 0.0  # one alone is the mean
+
+
+@pytest.mark.parametrize("lanes", [2, 3, 8])
+def test_lanes_differ_by_the_density_of_their_distances(lanes: int) -> None:
+    """The distances of all lanes but one have a normal distribution, and the last adds none."""
+    error, most = 0.5, 2.5
+    drawn = np.random.default_rng(lanes).normal(0.0, 1.0, lanes)
+    offsets = drawn - drawn.mean()
+
+    def density(tried: float) -> float:
+        """Return the density for independent lanes and errors, less their mean."""
+        centred = (np.eye(lanes) - 1.0 / lanes)[1:, 1:]
+        covariance = (error**2 + tried**2) * centred
+        return multivariate_normal(np.zeros(lanes - 1), covariance).pdf(offsets[1:])
+
+    exact = np.mean([density(tried) for tried in np.linspace(0.0, most, SPREADS_TRIED)])
+    spread = np.full(lanes, error * math.sqrt(1.0 - 1.0 / lanes))
+    found = lanes_differ(offsets, spread, most)
+    assert found == pytest.approx(math.log(exact / density(0.0)), abs=1e-9)
 
 
 @pytest.mark.parametrize("ratio", [1e-9, 0.3, 1.0, 40.0])

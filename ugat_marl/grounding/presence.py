@@ -125,17 +125,17 @@ def lanes_differ(offsets: Floats, spread: Floats, most: float) -> float:
     """Return the log of how much more likely offsets of lanes are if lanes differ.
 
     If they differ, each is drawn from a normal distribution, whose standard deviation is somewhere
-    between 0 and `most`. One lane alone tells nothing: 0.
+    between 0 and `most`. Offsets from a mean add up to 0: those of n lanes are n - 1 numbers. One
+    lane alone tells nothing: 0.
 
     Args:
         offsets: Estimated distance of each lane from the mean, ``(lanes,)``.
-        spread: Standard deviations of the estimates, ``(lanes,)``.
+        spread: Standard deviations of these estimates, ``(lanes,)``.
         most: Largest standard deviation of the lanes.
     """
     tried = np.linspace(0.0, most, SPREADS_TRIED)[:, None]
-    if len(offsets) < 2:  # a lane alone is the mean
-        return 0.0
-    deviation = np.hypot(spread, tried)
-    logs = (-0.5 * (offsets / deviation) ** 2 - np.log(deviation)).sum(1)
+    free = 1.0 - 1.0 / len(offsets)
+    deviation = np.hypot(spread, np.sqrt(free) * tried)
+    logs = free * (-0.5 * (offsets / deviation) ** 2 - np.log(deviation)).sum(1)
     differ = np.log(np.mean(np.exp(logs - logs.max()))) + logs.max()
     return float(differ - logs[0])
