@@ -101,6 +101,24 @@ def test_no_more_worlds_are_played_than_allowed(most: int) -> None:
     assert race.worlds == most == sum(len(worlds) for _, worlds in streets.rounds)
 
 
+def test_worlds_without_traffic_do_not_count() -> None:
+    slow, fast = 203.0 + noise(1) / 10, 200.0 + noise(2) / 10
+    slow[3] = fast[3] = np.nan
+    race = race_policies(["slow", "fast"], 40, Streets(slow=slow, fast=fast).play)
+    assert (race.best, race.worlds) == ("fast", 8)
+    assert race.times_s["slow"] == pytest.approx(np.nanmean(slow[:8]))
+    assert race.times_s["fast"] == pytest.approx(np.nanmean(fast[:8]))
+
+
+def test_a_policy_that_alone_lacks_a_travel_time_leaves() -> None:
+    lost, fine = 100.0 + noise(1), 200.0 + noise(2)
+    lost[3] = np.nan
+    streets = Streets(lost=lost, fine=fine)
+    race = race_policies(streets.names, 40, streets.play)
+    assert (race.best, len(streets.rounds)) == ("fine", 1)
+    assert np.isnan(race.times_s["lost"])
+
+
 def test_a_single_policy_plays_one_round() -> None:
     streets = Streets(alone=100.0 + noise(1))
     race = race_policies(streets.names, 40, streets.play)

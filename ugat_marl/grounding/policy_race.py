@@ -46,21 +46,27 @@ def race_policies(
 ) -> PolicyRace:
     """Compare policies in more and more worlds, until no other one may be better than the best.
 
+    Worlds in which no policy has a travel time do not count, since nobody travels there. A policy
+    that lacks one where another has it leaves.
+
     Args:
         names: Policies that take part; of equal ones the first is the best.
         most: Most worlds in which a policy plays, at least 1.
         play: Called with the policies of a round and the numbers of its worlds; returns travel
-            times in s, ``(policies, worlds)``.
+            times in s, ``(policies, worlds)``; NaN where no vehicle is due.
     """
     played_s = {name: np.empty(0) for name in names}
     best, running, done = names[0], list(names), 0
     while not done or (done < most and len(running) > 1):
         worlds = range(done, min(done + ROUND, most))
-        for name, times_s in zip(running, play(tuple(running), worlds), strict=True):
+        round_s = play(tuple(running), worlds)
+        round_s = round_s[:, ~np.isnan(round_s).all(0)]
+        for name, times_s in zip(running, round_s, strict=True):
             played_s[name] = np.append(played_s[name], times_s)
         done = worlds.stop
+        running = [name for name in running if not np.isnan(played_s[name]).any()]
         best = min(running, key=lambda name: played_s[name].mean())
-        if done > 1:
+        if len(played_s[best]) > 1:
             running = _running(played_s, running, best)
     mean_s = played_s[best].mean()
     times_s = {name: mean_s + _behind_s(played_s, name, best).mean() for name in names}
