@@ -210,6 +210,7 @@ def test_an_effect_can_be_left_out() -> None:
 def test_a_posterior_survives_its_checkpoint_and_refuses_another_network() -> None:
     posterior = Posterior.fit(WORLDS, SIMULATED, summary(WORLDS.draw(9), 9))
     again = Posterior.from_state(WORLDS, posterior.state_dict())
+    assert again.state_dict() == posterior.state_dict()
     assert np.array_equal(again.draw(4).effects, posterior.draw(4).effects)
     with pytest.raises(CheckpointError, match="another network"):
         Posterior.from_state(WorldPrior.of(LANES[:3]), posterior.state_dict())
@@ -229,6 +230,33 @@ def test_a_street_without_unused_green_is_given_none_on_average() -> None:
     truth = WorldValues(np.array([x.nominal for x in WORLDS.library]), np.zeros((len(LANES), 2)))
     sample_s = Posterior.fit(WORLDS, SIMULATED, summary(truth, 5)).sample(400)[1]
     assert np.quantile(sample_s[:, :, 0].mean(1), 0.05) == 0.0
+
+
+def test_a_log_that_no_world_resembles_is_told() -> None:
+    """Nine of its statistics are far above those of all worlds: no effect within its range."""
+    street = summary(WORLDS.draw(9), 9)
+    street.values[:, :9] += 3.0
+    posterior = Posterior.fit(WORLDS, SIMULATED, street)
+    assert posterior.beyond == pytest.approx(9 / len(NAMES))
+    assert posterior.is_unlike and "headway" in posterior.beyond_range
+    told, *_ = posterior.describe()
+    assert told.startswith("the log is unlike every simulated world: 41% of its statistics")
+    assert ", ".join(posterior.beyond_range) in told
+    numbers = posterior.as_dict({"a": range(len(LANES))})
+    assert numbers["street/beyond_worlds"] == pytest.approx(9 / len(NAMES))
+    inside = dataclasses.replace(posterior, answer=WORLDS.scaled(WORLDS.ends)[1])
+    assert not inside.beyond_range and not inside.is_unlike
+    assert dataclasses.replace(inside, beyond=np.array(0.6)).is_unlike
+
+
+def test_streets_of_the_prior_are_like_some_world() -> None:
+    posteriors = [
+        Posterior.fit(WORLDS, SIMULATED[:160], summary(WORLDS.draw(k), k))
+        for k in range(1000, 1050)
+    ]
+    assert sum(posterior.is_unlike for posterior in posteriors) <= 1
+    assert posteriors[0].describe()[0].startswith("effects: ")
+    assert "street/beyond_worlds" not in posteriors[0].as_dict({"a": range(len(LANES))})
 
 
 def test_a_part_that_was_not_fitted_is_not_told() -> None:

@@ -283,6 +283,12 @@ class SimulatedLog:
 NAMED = 0.1
 """Least chance of an effect that is said."""
 
+BEYOND = 0.5
+"""Share of a log's statistics beyond those of all worlds above which it is unlike them. Of streets
+drawn from the prior of `single-v1` at most one in a hundred is above it, with 60 worlds or more."""
+BEYOND_AT_END = 0.1
+"""The same share where an effect is answered beyond its range, too: two in a hundred."""
+
 
 @dataclass(frozen=True)
 class Posterior:
@@ -296,6 +302,8 @@ class Posterior:
         offsets_s: Answer for the distance of each lane from the mean, in s, ``(lanes, 2)``.
         offset_errors_s: Its residuals in the simulated worlds, ``(n, lanes, 2)``.
         chances: Weights of these residuals, ``(n,)``.
+        beyond: Share of the network's statistics in the street's log that are beyond those of all
+            simulated worlds, ``()``.
     """
 
     worlds: WorldPrior
@@ -304,6 +312,7 @@ class Posterior:
     offsets_s: Floats
     offset_errors_s: Floats
     chances: Floats
+    beyond: Floats
 
     @classmethod
     def fit(
@@ -323,6 +332,9 @@ class Posterior:
         known = in_worlds & ~np.isnan(street.values)
         street, *summaries = (s.where(known) for s in (street, *(w.summary for w in simulated)))
         network = np.stack([summary.network for summary in summaries])
+        told = ~np.isnan(street.network)
+        low, high = np.nanmin(network[:, told], 0), np.nanmax(network[:, told], 0)
+        beyond = (street.network[told] < low) | (street.network[told] > high)
         design = Design.of(network)
         x, x_street = design.inputs(network), design.inputs(street.network[None])
         effects = worlds.scaled(np.stack([item.values.effects for item in simulated]))
@@ -355,6 +367,7 @@ class Posterior:
             answer_s - answer_s.mean(0),
             lane_errors - lane_errors.mean(1, keepdims=True),
             kernel(predicted, answer, errors),
+            np.array(beyond.sum() / max(beyond.size, 1)),
         )
 
     def draw(self, seed: int, chance: float | None = None) -> WorldValues:
@@ -395,6 +408,23 @@ class Posterior:
         high = np.concatenate((most, [prior.high_s for prior in SERVICE]))
         return Presence.of(log_odds, self.calibration, self.answer, nominal, low, high)
 
+    @property
+    def beyond_range(self) -> list[str]:
+        """Names of effects answered beyond their range by more than a standard deviation."""
+        low, _, high = self.worlds.scaled(self.worlds.ends)
+        answer = self.answer[: len(low)]
+        error = np.sqrt(np.diag(self.calibration.covariance))[: len(low)]
+        outside = (answer < low - error) | (answer > high + error)
+        return [
+            item.name for item, is_out in zip(self.worlds.library, outside, strict=True) if is_out
+        ]
+
+    @property
+    def is_unlike(self) -> bool:
+        """True if no simulated world is like the street; what is fitted then says little."""
+        limit = BEYOND_AT_END if self.beyond_range else BEYOND
+        return bool(self.beyond > limit)
+
     def sample(self, number: int, seed: int = 0) -> tuple[Floats, Floats]:
         """Return effects ``(number, effects)`` and service ``(number, lanes, 2)`` of draws."""
         generator = numpy_generator(seed, "worlds", "sample")
@@ -402,9 +432,19 @@ class Posterior:
         return np.stack([v.effects for v in drawn]), np.stack([v.service_s for v in drawn])
 
     def describe(self) -> list[str]:
-        """Return what was found, a line for each part that was fitted."""
+        """Return what was found, a line for each part that was fitted.
+
+        Another line says it if no simulated world is like the street.
+        """
         effects, service_s = self.sample(DRAWS)
         lines: list[str] = []
+        if self.is_unlike:
+            effects_beyond = ", ".join(self.beyond_range) or "none"
+            lines.append(
+                f"the log is unlike every simulated world: {self.beyond:.0%} of its statistics are "
+                f"beyond theirs (effects at the end of their range: {effects_beyond}); trust no "
+                "fitted value, and compare the simulation's network and traffic with the street's"
+            )
         if self.worlds.library:
             low, high = np.quantile(effects, (0.05, 0.95), axis=0).round(4)  # as in a world
             ranges = zip(self.worlds.library, low, high, strict=True)
@@ -425,11 +465,15 @@ class Posterior:
     def as_dict(self, lanes_of: Mapping[str, Sequence[int]]) -> dict[str, float]:
         """Return flat numbers for the metrics of a run: medians and 90 % intervals.
 
+        Where no simulated world is like the street, ``street/beyond_worlds`` is `beyond`.
+
         Args:
             lanes_of: Agent to the positions of its lanes.
         """
         effects, service_s = self.sample(DRAWS)
         numbers: dict[str, float] = {}
+        if self.is_unlike:
+            numbers["street/beyond_worlds"] = float(self.beyond)
         for place, item in enumerate(self.worlds.library):
             low, middle, high = np.quantile(effects[:, place], (0.05, 0.5, 0.95))
             numbers[f"effects/{item.name}"] = float(middle)
@@ -476,6 +520,7 @@ class Posterior:
             "offsets_s": (lanes, 2),
             "offset_errors_s": (number, lanes, 2),
             "chances": (number,),
+            "beyond": (),
         }
         for name, shape in shapes.items():
             if parts[name].shape != shape:
@@ -488,7 +533,7 @@ class Posterior:
         return cls(worlds, calibration=Calibration(**how), **own)
 
 
-_NUMBERS = ("answer", "offsets_s", "offset_errors_s", "chances")
+_NUMBERS = ("answer", "offsets_s", "offset_errors_s", "chances", "beyond")
 
 
 def at_least_0(service_s: Floats) -> Floats:

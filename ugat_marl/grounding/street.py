@@ -76,7 +76,7 @@ from ugat_marl.seeding import derive_seed, numpy_generator
 
 KIND = "street"
 """Name of this kind of checkpoint, written into the file."""
-VERSION = 2
+VERSION = 3
 """Version of this kind of checkpoint. It changes with what a fit holds."""
 
 PARTS = ("channel", "eyes", "service", "effects")
