@@ -9,7 +9,7 @@ from ugat_marl.errors import counted, listed
 from ugat_marl.experiments.driver import OTHER_PARTS, record_of
 from ugat_marl.experiments.forked import jobs_fork_on
 from ugat_marl.experiments.jobs import Job, JobRecord
-from ugat_marl.grounding import EPISODES_PER_DELAY, ROLL_OUTS, UgatConfig
+from ugat_marl.grounding import ROLL_OUTS, UgatConfig, episodes_under_delays
 from ugat_marl.parallel import Workers, in_this_process, parts_at_a_time
 from ugat_marl.policies import (
     STANDARD_RULES,
@@ -221,7 +221,7 @@ def _grounded_work(
     rollouts = ugat.sim_rollouts + ugat.real_rollouts
     work["roll-outs"] = (2 * times, rollouts / 2)
     if ugat.matches:
-        work["under delays"] = (times * EPISODES_PER_DELAY * (ugat.most_delay_s + 1), 1.0)
+        work["under delays"] = (times * episodes_under_delays(ugat.most_delay_s), 1.0)
     work["fitting"] = (3 * ugat.fit.epochs * times, EPOCH)
     work["grounded"] = (times * ugat.grounded_episodes, 1.0)
     return work

@@ -64,11 +64,11 @@ from .ugat import Ugat as Ugat
 from .uncertainty import UNCERTAINTY_METHODS as UNCERTAINTY_METHODS
 from .view import InputsConfig as InputsConfig
 from .view import neighbours_of as neighbours_of
-from .worlds import EPISODES_PER_DELAY as EPISODES_PER_DELAY
 from .worlds import RecordedWorld as RecordedWorld
 from .worlds import RollOutSettings as RollOutSettings
 from .worlds import SimulatedWorld as SimulatedWorld
 from .worlds import TransitionSource as TransitionSource
+from .worlds import episodes_under_delays as episodes_under_delays
 from .worlds import roll_outs as roll_outs
 from .wrappers import ChangePenalty as ChangePenalty
 from .wrappers import GroundedEnv as GroundedEnv

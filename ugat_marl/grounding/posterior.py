@@ -431,12 +431,17 @@ class Posterior:
         drawn = [self.drawn(generator) for _ in range(number)]
         return np.stack([v.effects for v in drawn]), np.stack([v.service_s for v in drawn])
 
+    @functools.cached_property
+    def _draws(self) -> tuple[Floats, Floats]:
+        """Draws of which intervals are told."""
+        return self.sample(DRAWS)
+
     def describe(self) -> list[str]:
         """Return what was found, a line for each part that was fitted.
 
         Another line says it if no simulated world is like the street.
         """
-        effects, service_s = self.sample(DRAWS)
+        effects, service_s = self._draws
         lines: list[str] = []
         if self.is_unlike:
             effects_beyond = ", ".join(self.beyond_range) or "none"
@@ -470,7 +475,7 @@ class Posterior:
         Args:
             lanes_of: Agent to the positions of its lanes.
         """
-        effects, service_s = self.sample(DRAWS)
+        effects, service_s = self._draws
         numbers: dict[str, float] = {}
         if self.is_unlike:
             numbers["street/beyond_worlds"] = float(self.beyond)

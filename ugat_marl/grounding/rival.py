@@ -18,14 +18,14 @@ from ugat_marl.data import TransitionLog
 from ugat_marl.effects import EVERYWHERE, Effect, LateGreen
 from ugat_marl.grounding.delays import episode_rewards, matching_delays
 from ugat_marl.grounding.street import Simulation, StreetWorld
-from ugat_marl.grounding.worlds import EPISODES_PER_DELAY, under_each_delay
+from ugat_marl.grounding.worlds import episodes_under_delays, under_each_delay
 from ugat_marl.policies import Learner, Policy
 from ugat_marl.seeding import derive_seed
 
 LONGEST_S = 5
 """Longest delay of greens that is tried, in s."""
 
-ROLL_OUTS = EPISODES_PER_DELAY * (LONGEST_S + 1)
+ROLL_OUTS = episodes_under_delays(LONGEST_S)
 """Episodes of the simulation with which rewards are matched, per iteration."""
 
 

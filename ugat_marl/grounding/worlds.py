@@ -125,7 +125,7 @@ class SimulatedWorld:
     @property
     def roll_outs_under_delays(self) -> int:
         """Number of roll-outs of `under_delays`."""
-        return EPISODES_PER_DELAY * (self._most_delay_s + 1)
+        return episodes_under_delays(self._most_delay_s)
 
     def _played_by(
         self,
@@ -146,6 +146,11 @@ class SimulatedWorld:
     def stop(self) -> None:
         """Stop the running roll-outs; later ones begin as usual."""
         self._stop.set()
+
+
+def episodes_under_delays(most_delay_s: int) -> int:
+    """Return the number of episodes of `under_each_delay`."""
+    return EPISODES_PER_DELAY * (most_delay_s + 1)
 
 
 def under_each_delay(
