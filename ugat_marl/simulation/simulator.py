@@ -280,13 +280,13 @@ def _zones(lanes: Sequence[str], behind: UpstreamLanes, zone_m: float) -> list[l
     length_m = libsumo.lane.getLength
     zones = [[_ZonePart(lane, length_m(lane) - zone_m, 1.0)] for lane in lanes]
     for zone, shares in zip(zones, behind.lanes, strict=False):
-        ends_m = {zone[0].lane: 0.0}  # distances of the ends of lanes from the stop line
+        ends_m: dict[str, float] = {zone[0].lane: 0.0}  # from the stop line, of the ends of lanes
         for _ in shares:  # each round finds a further lane, if one is left
             for name, _ in shares:
                 for link in libsumo.lane.getLinks(name):
-                    ahead = link[4] or link[0]
+                    ahead = str(link[4] or link[0])
                     if ahead in ends_m:
-                        end_m = ends_m[ahead] + length_m(ahead)
+                        end_m: float = ends_m[ahead] + length_m(ahead)
                         ends_m[name] = min(end_m, ends_m.get(name, end_m))
         zone += [
             _ZonePart(name, length_m(name) + ends_m[name] - zone_m, share)
