@@ -238,6 +238,14 @@ def test_late_greens_are_refused() -> None:
         SimulatedStreet(scenario, 0, ())
 
 
+def test_detectors_see_the_vehicle_that_closes_a_lane() -> None:
+    scenario = scenario_in_domain(load_scenario("single-v1"), "lane_closure=northA_A1_1,55,145")
+    with SimulatedStreet(scenario, 0, ("northA_A1_1",)) as street:
+        street.wait(120.0)
+        counted = street.read()["northA_A1_1"]
+    assert counted.vehicles >= 1 and counted.halting >= 1
+
+
 @pytest.mark.parametrize(
     "effect",
     [

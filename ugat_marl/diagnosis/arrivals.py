@@ -43,6 +43,7 @@ from ugat_marl.scenarios import (
     Passages,
     Period,
     Scenario,
+    edge_of_lane,
 )
 
 _Came = tuple[float, frozenset[str]]
@@ -189,11 +190,24 @@ class Arrivals:
         way = self._way(_route(element))
         if way.approach is None:
             return None
-        way_s = way.approach_s / _factor(element)
+        way_s = way.approach_s / _factor(element) + self._stopped_s(element, way.approach)
         time = depart_s(element) + way_s
         if not time >= period.begin_s:
             return None
         return _Coming(way.approach, time, way_s, way.following, element)
+
+    def _stopped_s(self, element: ET.Element, approach: str) -> float:
+        """Return how long a vehicle stops on its way to the advance detector of an approach, s."""
+        edges = _route(element).split()
+        before = edges[: edges.index(approach)]
+        detector_m = self._approaches[approach][0].position_m
+        stopped_s = 0.0
+        for stop in element.iterfind("stop"):
+            edge = stop.get("edge") or edge_of_lane(stop.get("lane", ""))
+            is_near = edge == approach and float(stop.get("endPos", "inf")) <= detector_m
+            if edge in before or is_near:
+                stopped_s += float(stop.get("duration", "0"))
+        return stopped_s
 
     def _way(self, route: str) -> _Way:
         """Return a route at the speed limit; kept, since many vehicles share few routes."""

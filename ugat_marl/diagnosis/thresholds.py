@@ -617,13 +617,13 @@ class Thresholds(DayThresholds):
     """Share of a measured difference that counts as noise during a fit: the simulation rounds to
     its steps, the street does not. By hand. Halved: large differences bias the values."""
     steps: int = 3
-    """Largest number of steps of a candidate's fit. By hand: enough to compare candidates. Halved:
-    values far from the first simulation are not reached."""
+    """Steps of a candidate's fit, unless its cost still falls by more than `falling`. By hand:
+    enough to compare candidates. Halved: values far from the first simulation are not reached."""
     falling: float = 0.1
     """Share of the cost above which a last step is followed by another one. By hand: such a fit is
     not at its end. Halved: fits of sets that explain little take longer."""
     steps_of_the_best: int = 6
-    """Largest number of further steps of the best set of a round. By hand: a step costs six days,
+    """Further steps of the best set of a round, or more likewise. By hand: a step costs six days,
     and what a fit leaves behind is searched in a whole round. Halved: in worlds with three effects
     some of them are left to a further round, which finds imitations."""
     steps_without: int = 2

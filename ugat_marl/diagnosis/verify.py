@@ -101,8 +101,8 @@ def tables_of(study: Study, base: Tested, best: Tested) -> Tables:
 def judged(study: Study, base: Tested, best: Tested) -> TrafficCheck | None:
     """Judge the correction on the held-out periods; None if it changes no traffic.
 
-    Days with measured arrivals show effects on departures in their counts alone. So counts decide
-    if there are no other effects; beside others, effects on departures are not judged.
+    Where arrivals are measured, simulated days show effects on departures in counts alone. So these
+    decide if there are no other effects; beside others, those on departures are not judged.
     """
     of_traffic = [effect for effect in best.model.effects if not effect.on_detectors]
     if not of_traffic:

@@ -286,7 +286,7 @@ class SimulatedStreet:
 
     def read(self) -> dict[str, LaneCount]:
         """Return the counts at the end of the last step."""
-        seen = self._snapshot
+        seen = self._snapshot.with_blockers()
         rows = zip(self._lanes, seen.vehicles.tolist(), seen.halting.tolist(), strict=True)
         return {lane: LaneCount(seen.time_s, *row) for lane, *row in rows}
 

@@ -29,8 +29,8 @@ class PolicyRace:
 
     Attributes:
         best: Name of the best policy.
-        times_s: Travel times in s by name. That of a policy which left is the time of the best one
-            plus their mean difference in the worlds in which both played.
+        times_s: Travel times in s by name. That of a policy which left is the time of the one that
+            was best then, plus their mean difference so far; NaN if it lacks travel times.
         worlds: Worlds in which the best policy played.
     """
 
@@ -56,6 +56,7 @@ def race_policies(
             times in s, ``(policies, worlds)``; NaN where no vehicle is due.
     """
     played_s = {name: np.empty(0) for name in names}
+    ahead: dict[str, str] = {}  # of a policy that left: the one that was best then
     best, running, done = names[0], list(names), 0
     while not done or (done < most and len(running) > 1):
         worlds = range(done, min(done + ROUND, most))
@@ -64,13 +65,29 @@ def race_policies(
         for name, times_s in zip(running, round_s, strict=True):
             played_s[name] = np.append(played_s[name], times_s)
         done = worlds.stop
-        running = [name for name in running if not np.isnan(played_s[name]).any()]
+        if not round_s.size:
+            break
+        before, running = running, [name for name in running if _is_whole(played_s[name])]
+        if not running:
+            break
         best = min(running, key=lambda name: played_s[name].mean())
         if len(played_s[best]) > 1:
             running = _running(played_s, running, best)
-    mean_s = played_s[best].mean()
-    times_s = {name: mean_s + _behind_s(played_s, name, best).mean() for name in names}
-    return PolicyRace(best, {name: float(time_s) for name, time_s in times_s.items()}, done)
+        ahead |= dict.fromkeys(set(before).difference(running), best)
+
+    def told_s(name: str) -> float:
+        if not _is_whole(played_s[name]):
+            return np.nan
+        if name not in ahead:
+            return float(played_s[name].mean())
+        return told_s(ahead[name]) + float(_behind_s(played_s, name, ahead[name]).mean())
+
+    return PolicyRace(best, {name: told_s(name) for name in names}, len(played_s[best]))
+
+
+def _is_whole(times_s: NDArray[np.float64]) -> bool:
+    """Return True if there are travel times, of all worlds."""
+    return bool(times_s.size) and not np.isnan(times_s).any()
 
 
 def _running(

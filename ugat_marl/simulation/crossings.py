@@ -46,6 +46,7 @@ class Crossings:
         places = {lane: place for place, lane in enumerate(lanes)}
         self._beyond = {road: _beyond(api, road, places) for road in sorted(short)}
         self._near: dict[str, set[str]] = {}
+        self._last: dict[str, str] = {}  # last road of the route of vehicles on roads at lights
 
     def add_to(self, left: NDArray[np.float64]) -> None:
         """Add to `left`, ``(lanes,)``, the vehicles that left a lane's road since the last call."""
@@ -56,6 +57,9 @@ class Crossings:
         for index, (earlier, later) in enumerate(zip(before, now, strict=False)):
             if earlier != later:  # the same in most seconds
                 gone.update(dict.fromkeys(set(earlier).difference(later), index))
+                if edge_of_lane(self._lanes[index]) in self._at_lights:
+                    new = set(later).difference(earlier)
+                    self._last.update((name, api.vehicle.getRoute(name)[-1]) for name in new)
         for name, index in gone.items():
             left[index] += self._has_left(name, edge_of_lane(self._lanes[index]))
         for road, beyond in self._beyond.items():
@@ -76,7 +80,7 @@ class Crossings:
         try:
             where: str = self._api.vehicle.getRoadID(name)  # of one that parks, the road beside it
         except self._api.TraCIException:  # it has left the simulation
-            return road not in self._at_lights
+            return road not in self._at_lights or self._last.pop(name, road) != road
         return where != road
 
     def _comes_from(self, name: str, road: str) -> bool:

@@ -210,7 +210,7 @@ def _times(path: Path, cells: pl.Series, time_zone: str, start: int, mapping: st
 
 def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
     empty = cells.is_null() | (cells == "")
-    cells = cells.str.replace(r"(:\d\d),(\d)", "$1.$2")
+    given, cells = cells, cells.str.replace(r"(:\d\d:\d\d),(\d)", "$1.$2")
     offset = cells.str.contains(_OFFSET)
     if offset.any():
         whole = (
@@ -238,7 +238,7 @@ def _parsed(path: Path, cells: pl.Series, start: int) -> pl.Series:
     wrong = best.is_null() & ~empty.fill_null(True)
     if wrong.any():
         at = int(wrong.arg_true()[0])
-        text = str(cells[at])[:40]
+        text = str(given[at])[:40]
         dotted = re.fullmatch(r"(\d{1,2})\.(\d{1,2})\.(\d{4})[ T]+(\d.*)", text, re.ASCII)
         if dotted:
             day, month, year, clock = dotted.groups()

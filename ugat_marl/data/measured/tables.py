@@ -469,9 +469,11 @@ def to_numbers(path: Path, cells: pl.Series) -> pl.Series:
         at = int(wrong.arg_true()[0])
         text = str(cells[at])
         wanted = "a number with a point, not a comma" if "," in text else "a number"
-        if clock := re.fullmatch(r"(\d{1,2}):(\d\d)(?::(\d\d))?", text, re.ASCII):
+        clock = re.fullmatch(r"(\d{1,2}):(\d\d)(?::(\d\d))?", text, re.ASCII)
+        if clock and name in TIMES:
             hours, minutes, seconds = (int(part or 0) for part in clock.groups())
-            wanted = f"seconds, {3600 * hours + 60 * minutes + seconds} for this time of day"
+            since_s = 3600 * hours + 60 * minutes + seconds
+            wanted = f"seconds of the scenario's clock, {since_s} if that is 0 at midnight"
         raise MeasuredDataError(
             f"{place(path, at + start)}: {name} is {text[:40]!r}; write {wanted}, or "
             "leave the row out"

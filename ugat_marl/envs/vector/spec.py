@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -247,8 +247,9 @@ def in_turn(domains: Domain | Sequence[Domain]) -> DomainOf:
         OptionError: The list is empty, or it is no list.
     """
     given: Any = domains
-    if not isinstance(given, Sequence):
+    if not isinstance(given, Iterable):
         raise OptionError(f"in_turn({given!r}): give a list of domains")
+    given = given if isinstance(given, Sequence) else list(given)
     listed: list[Any] = [given] if given and is_one_domain(given) else list(given)
     if not listed:
         raise OptionError("in_turn() needs at least one domain")
