@@ -30,14 +30,19 @@ def phase_with(env: TrafficEnv, lane: str) -> int:
     return next(i for i, state in enumerate(item.phases) if state[letter] in "Gg")
 
 
+def rewards_of_green(env: TrafficEnv, lane: str, decisions: int) -> list[float]:
+    """Begin an episode, show green for a lane and nothing else, and return the rewards."""
+    env.reset(seed=1)
+    (agent,) = env.agents
+    green = phase_with(env, lane)
+    return [env.step({agent: green})[1][agent] for _ in range(decisions)]
+
+
 @pytest.mark.parametrize("domain", ["sim", "reach=100", "reach=300"])
 def test_every_car_that_is_held_up_counts_once(short_entry: Scenario, domain: str) -> None:
     """North has green for ever: all sixty cars of the west wait, wherever they stand."""
     env = ugat_marl.parallel_env(short_entry, domain)
-    env.reset(seed=1)
-    (agent,) = env.agents
-    green = phase_with(env, "NM_0")
-    rewards = [env.step({agent: green})[1][agent] for _ in range(60)]
+    rewards = rewards_of_green(env, "NM_0", 60)
     assert env.snapshot.backlog > 20
     assert rewards[-1] == pytest.approx(-60)
     near = Rewarder(env.network, "queue").rewards(env.snapshot, env.snapshot)
@@ -53,10 +58,7 @@ def test_who_is_due_later_on_the_route_counts_once(domain: str, tmp_path: Path) 
         for i in range(40)
     )
     env = ugat_marl.parallel_env(crossroads_with(cars, tmp_path, 50, 60), domain)
-    env.reset(seed=1)
-    (agent,) = env.agents
-    green = phase_with(env, "NM_0")
-    rewards = [env.step({agent: green})[1][agent] for _ in range(6)]
+    rewards = rewards_of_green(env, "NM_0", 6)
     assert env.snapshot.backlog > 30
     assert rewards[-1] == pytest.approx(-40)
     env.close()

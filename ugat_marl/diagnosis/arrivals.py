@@ -198,11 +198,14 @@ class Arrivals:
 
     def _stopped_s(self, element: ET.Element, approach: str) -> float:
         """Return how long a vehicle stops on its way to the advance detector of an approach, s."""
+        stops = element.findall("stop")
+        if not stops:  # as nearly always
+            return 0.0
         edges = _route(element).split()
         before = edges[: edges.index(approach)]
         detector_m = self._approaches[approach][0].position_m
         stopped_s = 0.0
-        for stop in element.iterfind("stop"):
+        for stop in stops:
             edge = stop.get("edge") or edge_of_lane(stop.get("lane", ""))
             is_near = edge == approach and float(stop.get("endPos", "inf")) <= detector_m
             if edge in before or is_near:

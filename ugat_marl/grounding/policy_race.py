@@ -94,16 +94,13 @@ def _running(
     played_s: Mapping[str, NDArray[np.float64]], running: Sequence[str], best: str
 ) -> list[str]:
     """Return the policies of the next round; the best one alone if no other is worth it."""
-    behind_s = {name: _behind_s(played_s, name, best) for name in running}
-    worlds = len(played_s[best])
+    behind_s = np.stack([_behind_s(played_s, name, best) for name in running])
+    worlds = behind_s.shape[1]
     limit = stdtrit(worlds - 1, 1 - CHANCE) / np.sqrt(worlds)
-    near = {
-        name: late_s
-        for name, late_s in behind_s.items()
-        if late_s.mean() <= limit * late_s.std(ddof=1)
-    }
-    gain_s = max(limit * late_s.std(ddof=1) - late_s.mean() for late_s in near.values())
-    return list(near) if gain_s > LEVEL * played_s[best].mean() else [best]
+    gains_s = limit * behind_s.std(1, ddof=1) - behind_s.mean(1)  # the most that chance leaves open
+    if gains_s.max() <= LEVEL * played_s[best].mean():
+        return [best]
+    return [name for name, gain_s in zip(running, gains_s, strict=True) if gain_s >= 0]
 
 
 def _behind_s(

@@ -32,6 +32,7 @@ class Crossings:
     def __init__(self, api: Any, lanes: Sequence[str]) -> None:
         self._api = api
         self._lanes = lanes
+        self._roads = [edge_of_lane(lane) for lane in lanes]
         self._on: list[tuple[str, ...]] = []
         self._at_lights = {
             edge_of_lane(lane)
@@ -57,11 +58,11 @@ class Crossings:
         for index, (earlier, later) in enumerate(zip(before, now, strict=False)):
             if earlier != later:  # the same in most seconds
                 gone.update(dict.fromkeys(set(earlier).difference(later), index))
-                if edge_of_lane(self._lanes[index]) in self._at_lights:
+                if self._roads[index] in self._at_lights:
                     new = set(later).difference(earlier)
                     self._last.update((name, api.vehicle.getRoute(name)[-1]) for name in new)
         for name, index in gone.items():
-            left[index] += self._has_left(name, edge_of_lane(self._lanes[index]))
+            left[index] += self._has_left(name, self._roads[index])
         for road, beyond in self._beyond.items():
             earlier = self._near.get(road, set())
             near = set(api.edge.getLastStepVehicleIDs(road))
