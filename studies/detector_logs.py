@@ -26,6 +26,7 @@ from ugat_marl.effects import load_scenario
 from ugat_marl.experiments import policy_factory, record
 from ugat_marl.grounding import (
     LaneView,
+    MeasuredSource,
     Posterior,
     RecordedWorld,
     Simulation,
@@ -77,7 +78,9 @@ def record_street(
     return _log(measured, scenario, domain, "best"), _log(measured, scenario, domain, "detections")
 
 
-def _log(measured: MeasuredData, scenario: Scenario, domain: str, source: str) -> TransitionLog:
+def _log(
+    measured: MeasuredData, scenario: Scenario, domain: str, source: MeasuredSource
+) -> TransitionLog:
     network = Network.read(scenario)
     return log_of_measured(
         measured, scenario, network, domain, "movements", source, periods="all"

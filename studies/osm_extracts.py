@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import osmium
+from osmium import osm
 
 from ugat_marl.cli import guarded
 from ugat_marl.errors import OutputError, ScenarioError, require_least
@@ -110,11 +111,11 @@ def read_extract(path: Path) -> Extract:
     largest = 0
     try:
         for item in osmium.FileProcessor(str(path)):
-            if item.is_node():
+            if isinstance(item, osm.Node):
                 places[item.id] = (item.location.lon, item.location.lat)
                 if item.tags.get("highway") == "traffic_signals":
                     signals.append(places[item.id])
-            elif item.is_way():
+            elif isinstance(item, osm.Way):
                 largest = max(largest, item.id)
     except (RuntimeError, osmium.InvalidLocationError) as error:
         raise ScenarioError(
@@ -136,9 +137,9 @@ def cut(extract: Extract, box: Box, out: Path) -> None:
     number = extract.largest_way
     with osmium.SimpleWriter(str(out), overwrite=True) as writer:
         for item in osmium.FileProcessor(str(extract.path)):
-            if item.is_node() and item.id in inside:
+            if isinstance(item, osm.Node) and item.id in inside:
                 writer.add_node(item)
-            elif item.is_way():
+            elif isinstance(item, osm.Way):
                 way = item.id
                 for part in _parts([node.ref for node in item.nodes], inside):
                     writer.add_way(item.replace(id=way, nodes=part))
@@ -146,7 +147,7 @@ def cut(extract: Extract, box: Box, out: Path) -> None:
                     number += 1
                     way = number
             elif (
-                item.is_relation()
+                isinstance(item, osm.Relation)
                 and item.tags.get("type") == "restriction"
                 and all(member.ref in kept.get(member.type, ()) for member in item.members)
             ):

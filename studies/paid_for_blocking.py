@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.stats import spearmanr
+from scipy.stats import rankdata
 
 from ugat_marl import parallel_env
 from ugat_marl.cli import guarded
@@ -158,7 +158,7 @@ def wrong_pairs(
 def rank_correlation(rows: Sequence[Paid], reward: str) -> float:
     """Return Spearman's correlation of the return with minus the travel time."""
     paid = [row.reward[reward] for row in rows]
-    return float(spearmanr(paid, [-row.att_s for row in rows]).statistic)
+    return float(np.corrcoef(rankdata(paid), rankdata([-row.att_s for row in rows]))[0, 1])
 
 
 def main() -> None:

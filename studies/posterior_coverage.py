@@ -286,16 +286,12 @@ class Network:
             parts = range(0, len(logs), episodes)
             logs = [TransitionLog.concatenate(logs[k : k + episodes]) for k in parts]
             played = [self.view.summary(log) for log in logs]
-            every = np.ones_like(played[0].rows, dtype=np.bool_)
-            columns = {
-                "values": np.stack([x.values for x in played]),
-                "rows": np.stack([x.rows for x in played]),
-                "usable": np.stack([every if x.usable is None else x.usable for x in played]),
-            }
+            values_of = np.stack([x.values for x in played])
+            rows_of = np.stack([x.rows for x in played])
             with replacing(kept) as part, part.open("wb") as file:
-                np.savez(file, **columns)
+                np.savez(file, values=values_of, rows=rows_of)
         with np.load(kept, allow_pickle=False) as file:
-            read = [file[name] for name in ("values", "rows", "usable")]
+            read = [file[name] for name in ("values", "rows")]
         return [Summary(*one) for one in zip(*read, strict=True)]
 
     def _play(self, values: Sequence[WorldValues], seed: int, title: str) -> list[TransitionLog]:

@@ -191,7 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             updates.
         OutputError: The folder holds weights already, or networks of another draw.
     """
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--networks", type=int, default=150)
     parser.add_argument("--largest", type=int, default=3, help="most intersections of a network")

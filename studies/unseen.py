@@ -176,8 +176,8 @@ def scenarios(given: argparse.Namespace) -> list[Path]:
     folders: list[Path] = []
     ranges = NetworkRanges(intersections=(1, given.largest), load=tuple(given.load))
     networks, towns = given.out / "networks", given.out / "towns"
-    is_to_cut = given.pbf is not None and not towns.exists()
-    extract = read_extract(given.pbf) if is_to_cut else None
+    pbf: Path | None = None if towns.exists() else given.pbf
+    extract = None if pbf is None else read_extract(pbf)
     draw = {"seed": given.seed, "largest": given.largest, "load": list(given.load)}
     require_same(networks / "draw.json", draw, begun=any(networks.glob("drawn-*")))
     for k in range(given.networks):

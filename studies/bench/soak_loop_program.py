@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ugat_marl.effects import load_scenario
-from ugat_marl.envs import parallel_env
+from ugat_marl.envs import Actions, parallel_env
 from ugat_marl.field import DecisionLog, FieldService, Health, LaneCount, Site
 from ugat_marl.policies import Policy, make_rule
 
@@ -108,7 +108,7 @@ class _Slow:
         self.env_options = policy.env_options
         self.reset = policy.reset
 
-    def act(self, observations: Any, infos: Any) -> Mapping[str, Any]:
+    def act(self, observations: Any, infos: Any) -> Actions:
         time.sleep(self._line.street.late_s if self._line.street else 0.0)
         return self._policy.act(observations, infos)
 

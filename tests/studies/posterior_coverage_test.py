@@ -84,3 +84,18 @@ def test_statistics_are_kept_under_all_that_decides_them(
     assert {source.name for source in posterior_coverage.SOURCES} == {
         "summaries.py", "posterior.py", "street.py", "worlds.py"
     }  # fmt: skip
+
+
+def test_statistics_of_streets_are_kept_and_read_again(tmp_path: Path) -> None:
+    network = Network.of("single-v1", "fixed-time:30", 1)
+    with pytest.MonkeyPatch.context() as shorter:
+        shorter.setattr(posterior_coverage, "DURATION_S", 200.0)
+        values = [network.worlds.draw(seed) for seed in (1, 2)]
+        first = network.summaries(values, 3, tmp_path, "streets", episodes=2)
+        shorter.setattr(Network, "_play", lambda *_: pytest.fail("simulated again"))
+        again = network.summaries(values, 3, tmp_path, "streets", episodes=2)
+    assert len(first) == 2
+    assert max(summary.rows.max() for summary in first) == 2 * 20  # every decision
+    for one, other in zip(first, again, strict=True):
+        assert np.array_equal(one.values, other.values, equal_nan=True)
+        assert np.array_equal(one.rows, other.rows)
