@@ -22,7 +22,7 @@ import pytest
 from ugat_marl.__main__ import main
 from ugat_marl.cli import diagnose as command
 from ugat_marl.data import CSV_HASHES, write_measured
-from ugat_marl.diagnosis import DiagnosisConfig, Pattern
+from ugat_marl.diagnosis import DetectionLimit, DiagnosisConfig, Pattern
 from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.effects import known_effects, load_scenario
 from ugat_marl.experiments import policy_factory, record
@@ -210,6 +210,7 @@ LIKE_ANOTHER = ("left", "alternatives[].effects", "best.effects", "unnamed")
 SOMETIMES = (
     {"effects[].evidence.source", "effects[].evidence.rival", "policy_gap", "traffic_check"}
     | {f"patterns[].{field}" for field in Pattern.__dataclass_fields__}
+    | {f"limits[].{field}" for field in DetectionLimit.__dataclass_fields__}
     | {f"alternatives[].{key}" for key in ("effects", "distance", "cost", "indistinct")}
 )
 

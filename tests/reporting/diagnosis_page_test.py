@@ -430,6 +430,36 @@ def test_the_summary_fits_80_columns(verdict: str) -> None:
     assert "something new" not in flat  # three disagreements are shown
 
 
+def test_limits_say_what_could_be_there_unseen(network: Network) -> None:
+    def limit(name: str, usual: float, hidden: float, shown: float | None) -> dict[str, Any]:
+        numbers = {"usual": usual, "hidden": hidden, "shown": shown}
+        return {"name": name, "parameter": "seconds", "unit": "s", **numbers}
+
+    limits = [
+        limit("headway", 1.0, 1.2625, 1.35),
+        limit("gap_acceptance", 1.0, 0.4, None),
+        limit("gap_acceptance", 1.0, 2.5, None),
+        limit("signal_clock", 0.0, -0.2, -0.4),
+        limit("signal_clock", 0.0, 2.0, None),
+    ]
+    found = diagnosis_of("no_discrepancy", limits=limits)
+    rows = [
+        ("gap acceptance", "1 s", "not even 0.4; not even 2.5"),  # what hides comes first
+        ("headway", "1 s", "1.35 or more"),
+        ("signal clock", "0 s", "−0.4 or less; not even 2"),
+    ]
+    assert sorted(words.limit_rows(found.limits)) == sorted(rows)
+    assert words.limit_rows(found.limits)[0] == rows[0]
+    text = printed(found)
+    assert max(map(len, text.splitlines())) <= 80
+    page = diagnosis_page(found, network)
+    for _, usual, shows in rows:
+        assert usual in text and shows in text and shows in page
+    assert "What the data would show" in page
+    assert "What the data would show" not in diagnosis_page(diagnosis_of("explained"), network)
+    assert _usual_commands(found)[0].endswith("--limits")
+
+
 def test_long_names_do_not_widen_the_summary() -> None:
     content = content_of()
     content["effects"][1]["place"] = "x" * 90

@@ -73,6 +73,9 @@ class Diagnose:
             not bring held-out travel times and queues nearer.
         unnamed: Where the named effects do not explain the data, try a correction of service and
             demand that imitates what is left. It has no name and says nothing of the cause.
+        limits: Where nothing but chance is left, find from which strength on the data would have
+            shown the effects that are not named. It takes longer than the search; the same command
+            with this option goes on from what is stored.
         report: Write the page report.html.
     """
 
@@ -95,6 +98,7 @@ class Diagnose:
     ray: RayAddress = None
     correct_anyway: bool = False
     unnamed: bool = False
+    limits: bool = False
     report: bool = True
 
     def run(self, console: Console) -> int:
@@ -132,6 +136,7 @@ class Diagnose:
             cache=self.cache,
             correct_anyway=self.correct_anyway,
             unnamed=self.unnamed,
+            limits=self.limits,
         )
 
     def _check_out(self) -> None:
@@ -182,6 +187,8 @@ class Diagnose:
             lines.append("The effects are faults of detectors; the simulation stays as it is.")
         elif not diagnosis.effects and diagnosis.verdict != "no_discrepancy":
             lines.append("There is no corrected scenario: no effect was found to correct it by.")
+        if diagnosis.verdict in ("no_discrepancy", "explained") and not self.limits:
+            lines.append("What could be there unseen, the same command with --limits says.")
         if diagnosis.not_corrected is not None:
             lines.append(f"{diagnosis.not_corrected} --correct-anyway does it all the same.")
         console.print("\n" + "\n".join(lines), soft_wrap=True)

@@ -14,6 +14,7 @@ from .records import Alternative as Alternative
 from .records import ApproachRow as ApproachRow
 from .records import Conclusion as Conclusion
 from .records import CriteriaRow as CriteriaRow
+from .records import DetectionLimit as DetectionLimit
 from .records import Diagnosis as Diagnosis
 from .records import Disagreement as Disagreement
 from .records import EffectRecord as EffectRecord

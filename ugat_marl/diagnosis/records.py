@@ -644,6 +644,27 @@ class Tables:
 
 
 @dataclass(frozen=True)
+class DetectionLimit:
+    """Strength of an effect from which on the data would show it, on one side of the usual value.
+
+    Attributes:
+        name: Name of the effect.
+        parameter: Name of its number.
+        unit: Unit of the numbers, "" for a pure one.
+        usual: Value in the scenario.
+        hidden: Strongest value found that would not show; `usual` if the weakest one tried would.
+        shown: Weakest value found that would show; None if the farthest one would not.
+    """
+
+    name: str
+    parameter: str
+    unit: str
+    usual: float
+    hidden: float
+    shown: float | None
+
+
+@dataclass(frozen=True)
 class Splits:
     """Ids of the measured periods.
 
@@ -737,6 +758,8 @@ class Diagnosis:
             one.
         policy_gap: Travel times by policy; None until `ugat-marl policy-gap` has measured them.
         ended_by: Setting of the budget that ended the diagnosis; None if none did.
+        limits: Detection limits of effects on the whole network; empty unless they were asked for
+            and nothing but chance is left.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -778,6 +801,7 @@ class Diagnosis:
     not_corrected: str | None
     policy_gap: dict[str, PolicyGap] | None = None
     ended_by: EndedBudget | None = None
+    limits: tuple[DetectionLimit, ...] = ()
 
     @property
     def budget_in_words(self) -> str:

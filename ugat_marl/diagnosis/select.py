@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +33,7 @@ from ugat_marl.diagnosis.propose import (
 from ugat_marl.diagnosis.prune import Pruner, doubtful
 from ugat_marl.diagnosis.records import Fitted, Located, Selected, Tested
 from ugat_marl.diagnosis.residual import Directions, Null
-from ugat_marl.diagnosis.statistics import Whitener, sum_of
+from ugat_marl.diagnosis.statistics import Array, Whitener, sum_of
 from ugat_marl.diagnosis.thresholds import Effort
 from ugat_marl.effects import Effect
 from ugat_marl.errors import OptionError, ScenarioError, SimulatorError
@@ -98,13 +98,24 @@ class Selector:
         Raises:
             OutOfTime: The budget does not suffice for their simulation.
         """
-        data = self._fitter.data
         self._places = tuple(
             self._directions(base.model, self._place_finder.everywhere(), 0, "places")
         )
-        directions = Directions((*self._library_directions(base.model, 0), *self._places))
-        null = self._null(base.model.tallies, data, directions, ())
-        return replace(base, residual=null.test(data))
+        self._library_directions(base.model, 0)
+        return replace(base, residual=self.null_of(base).test(self._fitter.data))
+
+    def null_of(self, tested: Tested) -> Null:
+        """Return the distribution of chance by which a model was tested along single effects."""
+        if not tested.model.members:
+            return self._null_of(tested.model, tested.model.tallies)
+        return self._null_of(tested.model, self._days(tested.model), tested.extra)
+
+    def _null_of(
+        self, model: Fitted, days: Sequence[Tally], extra: Mapping[str, Array] | None = None
+    ) -> Null:
+        fitted = tuple(change for change, _ in self._fitter.changes(model))
+        directions = Directions((*self._of_library, *self._places), extra, fitted)
+        return self._null(days, self._fitter.data, directions, model.effects)
 
     def select(
         self,
@@ -193,10 +204,8 @@ class Selector:
         errors, extra = uncertainty(fitter, model, days)
         for name, difference in self._first.difference.items():
             extra[name] = extra[name] + (self._thresholds.tolerance * difference) ** 2
-        fitted = tuple(change for change, _ in fitter.changes(model))
-        directions = Directions((*self._of_library, *self._places), extra, fitted)
-        null = self._null(days, fitter.data, directions, model.effects)
-        return Tested(model, null.test(fitter.data, extra), errors, extra)
+        residual = self._null_of(model, days, extra).test(fitter.data, extra)
+        return Tested(model, residual, errors, extra)
 
     def exact(self, tested: Tested) -> Tested:
         """Add the error of statistics that are not linear in the values, by further days.

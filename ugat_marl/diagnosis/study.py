@@ -90,6 +90,7 @@ class DiagnosisConfig:
             held-out traffic no nearer.
         unnamed: Try a correction of service and demand that has no name, where the named effects do
             not explain the data.
+        limits: Find from which strength on the data would show effects that are not named.
         thresholds: Numbers of the method.
     """
 
@@ -103,6 +104,7 @@ class DiagnosisConfig:
     effort: Effort | None = None
     correct_anyway: bool = False
     unnamed: bool = False
+    limits: bool = False
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def __post_init__(self) -> None:
@@ -257,6 +259,7 @@ class Study:
         strengths = sum(len(hypothesis.levels) for hypothesis in self.hypotheses)
         lanes = min(len(self.layout.lanes), limits.most_lanes)
         test = limits.settling_days + effort.test + MOVES_OF_A_VALUE * effort.fit
+        limit_days = limits.days_of_a_limit(len(self.fit))
         return {
             "the detectors": Share(limits.measurement_days),
             "the scenario as it is": Share(effort.base),
@@ -272,6 +275,9 @@ class Study:
             "patterns": Share(limits.pattern_days),
             "unnamed": Share(limits.settling_days if self.config.unnamed else 0),
             "without single": Share(2, limits.steps_without * effort.fit + limits.settling_days),
+            "what the data would show": Share(
+                strengths if self.config.limits else 0, (1 + limits.limit_halvings) * limit_days
+            ),
         }
 
     def detectors_as_they_are(self, reporter: Reporter) -> Study:

@@ -807,6 +807,21 @@ class Thresholds(DayThresholds):
     """Largest number of patterns that are told. By hand: a page has room for more than a reader has
     patience. Halved: one."""
 
+    # --- detection limits -----------------------------------------------------------------------
+
+    limit_power: float = 0.8
+    """Share of data sets that must contradict a model without an effect, so that the data would
+    show it. The usual power of a study (Cohen 1988). Halved: limits lie nearer to the usual value,
+    and most streets with such an effect pass unseen."""
+    limit_sets: int = 20
+    """Data sets drawn for that share. Halved: it is known to 13 instead of 9 %."""
+    limit_days: int = 10
+    """Least number of days from which they are drawn; else twice that of the fitted periods. By
+    hand. Halved: sets have more days in common, and the share is known less exactly."""
+    limit_halvings: int = 3
+    """Times by which the way from the usual to the farthest value is halved. By hand: a limit is
+    known to an eighth of this way. Halved: to a quarter, in two thirds of the time."""
+
     # --- check of traffic before the scenario is corrected ------------------------------------
 
     check_draws: int = 200
@@ -843,6 +858,10 @@ class Thresholds(DayThresholds):
     interval_s: float = 900.0
     """Interval of FHWA's criteria, s (FHWA-HOP-18-036, chapter 5). Halved: counts are noisier and
     fail the criteria."""
+
+    def days_of_a_limit(self, periods: int) -> int:
+        """Return the days from which data sets of so many periods are drawn for a limit."""
+        return max(self.limit_days, 2 * periods)
 
     def of_sightings(self) -> str:
         """Return a digest of the numbers in `OF_SIGHTINGS`, for the key of cached days."""

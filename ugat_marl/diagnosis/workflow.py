@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ugat_marl.data import MeasuredData, installed_versions
+from ugat_marl.diagnosis.detection_limits import detection_limits
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.hypotheses import WINDOW, Members
 from ugat_marl.diagnosis.locate import disagreements, locate_gap
@@ -203,7 +204,17 @@ def _diagnosed(
         return _nothing_simulated(study, timing), study.errors_of_detectors, ()
     search = _searched(study, base, reporter)
     diagnosis, effects = _concluded(search, timing, reporter)
+    if study.config.limits and diagnosis.verdict in ("no_discrepancy", "explained"):
+        diagnosis = _with_limits(search, diagnosis, reporter)
     return diagnosis, search.study.errors_of_detectors, effects
+
+
+def _with_limits(search: _Search, diagnosis: Diagnosis, reporter: Reporter) -> Diagnosis:
+    """Add the detection limits of the effects that a verdict does not name."""
+    selected = search.selected if diagnosis.verdict == "explained" else None
+    tested = search.located.base if selected is None else selected.best
+    limits = detection_limits(search.study, search.selector, tested, reporter)
+    return replace(diagnosis, limits=limits)
 
 
 @dataclass(frozen=True, eq=False)

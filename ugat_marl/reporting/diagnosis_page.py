@@ -104,6 +104,8 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         map_key=[(f"d{place}", text) for place, (_, text) in enumerate(DISAGREEMENT)],
         statistics=_statistics(page, diagnosis),
         where=_where(diagnosis, names),
+        limits=_limits(diagnosis),
+        limits_mean=words.LIMITS,
         patterns=_patterns(diagnosis),
         unnamed=_effects(diagnosis.unnamed, names),
         ranking=_ranking(diagnosis, names),
@@ -291,6 +293,12 @@ def _patterns(diagnosis: Diagnosis) -> Grid | None:
     return Grid(headings, rows, headings[1:]) if rows else None
 
 
+def _limits(diagnosis: Diagnosis) -> Grid | None:
+    """Return a table of the detection limits; None if they were not found."""
+    rows = words.limit_rows(diagnosis.limits)
+    return Grid(("effect", "usual value", "would show"), rows) if rows else None
+
+
 def _ranking(diagnosis: Diagnosis, names: LightNames) -> list[dict[str, Any]]:
     """Return the simulated explanations, the chosen one first."""
     if not diagnosis.alternatives:
@@ -427,6 +435,8 @@ def _usual_commands(diagnosis: Diagnosis) -> list[str]:
         options += " --leave-out " + " ".join(diagnosis.left_out)
     check = diagnosis.traffic_check
     no_nearer = check is not None and not check.better
+    if diagnosis.limits:
+        options += " --limits"
     if diagnosis.unnamed:
         options += " --unnamed"
     elif diagnosis.not_corrected is None and (

@@ -38,6 +38,8 @@ def diagnosis_summary(diagnosis: Diagnosis, names: LightNames) -> RenderableType
         blocks.append(_effects(diagnosis.effects, names))
         if domain := words.as_domain(diagnosis.effects):
             blocks.append(Text(f"as a domain: {domain}"))
+    if diagnosis.limits:
+        blocks.append(_limits(diagnosis))
     if diagnosis.where:
         blocks.append(_where(diagnosis, names))
     if diagnosis.heldout is not None:
@@ -61,6 +63,15 @@ def _effects(effects: Sequence[NamedEffect], names: LightNames) -> Table:
     for effect in effects:
         when = [words.window(effect.window) or "always"] if timed else []
         cells = [words.effect_name(effect), words.place(effect, names), *when, words.values(effect)]
+        table.add_row(*map(Text, cells))
+    return table
+
+
+def _limits(diagnosis: Diagnosis) -> Table:
+    table = titled_table("values that would show in at least four of five data sets like this")
+    for heading in ("effect", "usual", "would show"):
+        table.add_column(heading, overflow="fold")
+    for cells in words.limit_rows(diagnosis.limits):
         table.add_row(*map(Text, cells))
     return table
 

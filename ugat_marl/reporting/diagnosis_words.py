@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 from ugat_marl.diagnosis import (
     WINDOW,
     ApproachRow,
     CriteriaRow,
+    DetectionLimit,
     Diagnosis,
     Disagreement,
     EffectRecord,
@@ -49,6 +50,13 @@ MEANINGS: dict[Verdict, str] = {
     "unknown": "Simulation and measurement disagree, and nothing in the library accounts for it. "
     "Any name would be a guess.",
 }
+
+LIMITS = (
+    "With an effect of these values on the whole network, at least four of five data sets like the "
+    "fitted periods would have contradicted the verdict. Nearer to the usual value it may be there "
+    "and unseen."
+)
+"""Meaning of the detection limits."""
 
 AT_AN_END = (
     "With these effects the simulation could have made the data they were judged on. But a value "
@@ -147,6 +155,29 @@ def _rounded(value: float, width: float) -> str:
     """Return a number rounded to two digits of its interval's width."""
     decimals = min(max(1 - math.floor(math.log10(max(width, 1e-9))), 0), 4)
     return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def limit_rows(limits: Sequence[DetectionLimit]) -> list[tuple[str, str, str]]:
+    """Return effect, usual value, and where the data would show it; those that hide come first."""
+    of_effects: dict[str, list[DetectionLimit]] = {}
+    for limit in limits:
+        of_effects.setdefault(limit.name, []).append(limit)
+
+    def shown(sides: Sequence[DetectionLimit]) -> int:
+        return sum(side.shown is not None for side in sides)
+
+    rows: list[tuple[str, str, str]] = []
+    for name, sides in sorted(of_effects.items(), key=lambda one: shown(one[1])):
+        usual = f"{number(sides[0].usual)} {sides[0].unit.replace('^2', '²')}".rstrip()
+        rows.append((name.replace("_", " "), usual, "; ".join(map(_limit, sides))))
+    return rows
+
+
+def _limit(side: DetectionLimit) -> str:
+    """Return where an effect would show on one side of its usual value."""
+    if side.shown is None:
+        return f"not even {number(side.hidden)}"
+    return f"{number(side.shown)} or {'less' if side.shown < side.usual else 'more'}"
 
 
 def disagreement_place(disagreement: Disagreement, names: LightNames) -> str:

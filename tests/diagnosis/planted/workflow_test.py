@@ -287,3 +287,22 @@ def test_a_search_without_time_for_a_test_keeps_its_nearest_explanation(
     whole_search = run(street, measured, tmp_path)
     assert whole_search["verdict"] == "explained"
     assert whole_search["heldout"]["before"] == found["heldout"]["before"]
+
+
+def test_limits_say_which_effects_the_data_would_have_shown(street, tmp_path: Path) -> None:
+    """No vehicle gives way on this crossing, so how drivers accept gaps changes nothing at all."""
+    found = run(
+        street,
+        street.measure("sim", seed=6),
+        tmp_path,
+        among={"headway", "gap_acceptance"},
+        limits=True,
+    )
+    assert found["verdict"] == "no_discrepancy"
+    limits = {(one["name"], one["hidden"] < one["usual"]): one for one in found["limits"]}
+    assert limits["gap_acceptance", True]["hidden"] == pytest.approx(0.4)
+    assert limits["gap_acceptance", True]["shown"] is None
+    assert limits["gap_acceptance", False]["shown"] is None
+    headway = limits["headway", False]
+    assert 1.0 <= headway["hidden"] < headway["shown"] < 1.7
+    assert headway["unit"] == "s"
