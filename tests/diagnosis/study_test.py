@@ -495,7 +495,8 @@ def test_of_several_places_the_busiest_one_counts() -> None:
 def test_every_task_of_a_diagnosis_is_part_of_the_whole() -> None:
     rooms = Path(module.__file__).parent
     source = "".join(
-        (rooms / name).read_text() for name in ("study.py", "select.py", "workflow.py")
+        (rooms / name).read_text()
+        for name in ("study.py", "select.py", "workflow.py", "detection_limits.py")
     )
     shown = re.findall(r"task\(\s*f?\"([^\"]+)\"", source)
     shown += re.findall(r"f\"(round [^\"]+)\"", source)
@@ -503,7 +504,7 @@ def test_every_task_of_a_diagnosis_is_part_of_the_whole() -> None:
     study: Any = object.__new__(Study)
     given = {
         "effort": Effort(), "config": DiagnosisConfig(), "hypotheses": (), "other_days": None,
-        "layout": SimpleNamespace(lanes=()),
+        "layout": SimpleNamespace(lanes=()), "fit": (),
     }  # fmt: skip
     for name, value in given.items():
         object.__setattr__(study, name, value)
