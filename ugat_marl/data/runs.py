@@ -22,7 +22,7 @@ import polars as pl
 from ugat_marl.data.curves import CURVES_FILE, EventFile
 from ugat_marl.data.row_hashes import UNREADABLE, damage, read_quietly, write_hashed
 from ugat_marl.errors import CheckpointError, OptionError, first_line
-from ugat_marl.files import lock, read_json, replacing, require_writable, write_whole
+from ugat_marl.files import lock, put_folder, read_json, replacing, require_writable, write_whole
 from ugat_marl.progress import Reporter
 
 CHECKPOINT_FOLDER = "checkpoint"
@@ -161,9 +161,7 @@ class Run:
             self.directory / CHECKPOINT_FOLDER,
             self.directory / f".{CHECKPOINT_FOLDER}.old",
         )
-        if current.exists():
-            current.rename(old)
-        fresh.rename(current)
+        put_folder(fresh, current, old)
         shutil.rmtree(old, ignore_errors=True)
         self.write_metrics()
 

@@ -19,6 +19,7 @@ from ugat_marl.scenarios import Network, Segment, SignalState, SignalTiming, sig
 
 _ENDING = frozenset("yYoO")
 """Yellow and off. Traffic may be in the junction, so the light shows a full yellow (again)."""
+_CLEARING = str.maketrans("YoOu", "yyyr")
 _NOT_GREEN = str.maketrans("yYoOu", "rrrrr")
 
 
@@ -44,9 +45,8 @@ class Light:
             )
         self.phases = tuple(phases)
         self._timing = timing
-        ends = "".join("y" if letter in _ENDING else letter for letter in shown)
         self._ending_s = timing.yellow_s if set(shown) & _ENDING else 0.0
-        self._ending = ends.translate(str.maketrans("u", "r"))
+        self._ending = shown.translate(_CLEARING)
         held = shown.translate(_NOT_GREEN)
         self._all = self.phases if held in self.phases else (*self.phases, held)
         index = self._all.index(held)
