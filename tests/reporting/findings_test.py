@@ -93,6 +93,10 @@ def test_effects_and_the_policy_that_was_kept(tmp_path: Path) -> None:
         "the policy kept so far 110 s, the policy after training 102 s, the rule 99 s. "
         "Kept was the rule."
     )
+    assert section["unlike"] == ""
+    section = found_on_street(record(tmp_path, numbers | {"street/beyond_worlds": 0.45}))
+    assert section is not None
+    assert section["unlike"].startswith("The log is unlike every simulated world: 45% of its")
     kept = tmp_path / "run" / "policies" / "fitted-street.pt"
     kept.parent.mkdir(parents=True)
     with contextlib.closing(ugat_marl.parallel_env("single-v1")) as env:

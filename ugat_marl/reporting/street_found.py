@@ -27,11 +27,24 @@ def found_on_street(record: RunRecord) -> dict[str, Any] | None:
     if "street/commands" not in record.last_iteration:
         return None
     return {
+        "unlike": _unlike(record),
         "commands": commands_found(record),
         "detectors": detectors_found(record),
         "effects": _effects(record),
         "kept": _kept(record),
     }
+
+
+def _unlike(record: RunRecord) -> str:
+    """Return a warning if no simulated world is like the street; "" if one is."""
+    beyond = record.last_iteration.get("street/beyond_worlds")
+    if beyond is None:
+        return ""
+    return (
+        f"The log is unlike every simulated world: {beyond:.0%} of its statistics are beyond "
+        "theirs. Trust no value below, and compare network and traffic of the simulation with "
+        "those of the street."
+    )
 
 
 def commands_found(record: RunRecord) -> str:
