@@ -587,9 +587,9 @@ def _mixture(explains: Sequence[NDArray[np.bool_]], config: ChannelConfig) -> tu
     Returns:
         The network's weights, ``(kinds,)``, and those of each intersection, ``(agents, kinds)``.
     """
-    rows = np.concatenate(explains, axis=1)
+    rows, number = _distinct(np.concatenate(explains, axis=1))
     kinds = len(rows)
-    if not rows.shape[1]:
+    if not len(number):
         weights = np.eye(kinds)[0]
         return weights, np.tile(weights, (len(explains), 1))
     # A lost command keeps the phase of the decision before, which a further lag explains almost as
@@ -598,9 +598,10 @@ def _mixture(explains: Sequence[NDArray[np.bool_]], config: ChannelConfig) -> tu
     best = -np.inf
     weights = np.eye(kinds)[-1]
     while True:
-        tried = [(_maximum(rows, support | {k}), k) for k in range(kinds) if k not in support]
+        others = [kind for kind in range(kinds) if kind not in support]
+        tried = [(_maximum(rows, number, support | {kind}), kind) for kind in others]
         (likelihood, found), lag = max(tried, key=lambda trial: trial[0][0])
-        if likelihood < best + config.gain * math.log(rows.shape[1]):
+        if likelihood < best + config.gain * math.log(number.sum()):
             break
         best, weights, support = likelihood, found, support | {lag}
         if len(support) == kinds:
@@ -613,21 +614,35 @@ def _mixture(explains: Sequence[NDArray[np.bool_]], config: ChannelConfig) -> tu
     return weights, np.stack([_own_weights(same, weights, config.pull) for same in telling])
 
 
-def _maximum(rows: NDArray[np.bool_], support: set[int]) -> tuple[float, Floats]:
+def _distinct(rows: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return the distinct columns, ``(kinds, n)``, and how often each is there, ``(n,)``.
+
+    Decisions are many, and explained in few ways.
+    """
+    codes = np.packbits(rows, axis=0)  # whole numbers are sorted sooner than rows
+    weights = 256 ** np.arange(len(codes), dtype=np.int64)[:, None]
+    _, first, number = np.unique((codes * weights).sum(0), return_index=True, return_counts=True)
+    return rows[:, first], number
+
+
+def _maximum(
+    rows: NDArray[np.bool_], number: NDArray[np.int64], support: set[int]
+) -> tuple[float, Floats]:
     """Return the largest log likelihood of the decisions, and its weights.
 
     Args:
-        rows: Kinds that explain each decision, ``(kinds, n)``.
+        rows: Kinds that explain each distinct decision, ``(kinds, n)``.
+        number: How often it is there, ``(n,)``.
         support: Kinds that may have a weight.
     """
     weights = np.array([float(kind in support) for kind in range(len(rows))]) / len(support)
     for _ in range(ROUNDS):
-        weights, before = _counts(rows, weights), weights
+        weights, before = _counts(rows, number, weights), weights
         weights = weights / weights.sum() if weights.sum() else before
         if np.abs(weights - before).max() < 1e-6:
             break
     chances = (rows * weights[:, None]).sum(0)
-    return float(np.log(np.maximum(chances, UNEXPLAINED)).sum()), weights
+    return float(np.log(np.maximum(chances, UNEXPLAINED)) @ number), weights
 
 
 def _own_weights(rows: NDArray[np.bool_], network: Floats, pull: float) -> Floats:
@@ -642,8 +657,9 @@ def _own_weights(rows: NDArray[np.bool_], network: Floats, pull: float) -> Float
         pull: Number of decisions that the weights of the network count as.
     """
     weights = network
+    rows, number = _distinct(rows)
     for _ in range(ROUNDS):
-        counts = _counts(rows, weights)
+        counts = _counts(rows, number, weights)
         weights, before = (pull * network + counts) / (pull + counts.sum()), weights
         if np.abs(weights - before).max() < 1e-6:
             break
@@ -681,8 +697,8 @@ def _draws(explains: Sequence[NDArray[np.bool_]], pull: float) -> Floats:
     return np.array(draws[SWEEPS * BURN_IN :: SWEEPS])
 
 
-def _counts(rows: NDArray[np.bool_], weights: Floats) -> Floats:
+def _counts(rows: NDArray[np.bool_], number: NDArray[np.int64], weights: Floats) -> Floats:
     """Return the expected number of decisions of each kind, ``(kinds,)`` (the E step)."""
     chances = rows * weights[:, None]
     total = chances.sum(0)
-    return (chances[:, total > 0] / total[total > 0]).sum(1)
+    return (chances[:, total > 0] / total[total > 0]) @ number[total > 0]
