@@ -226,6 +226,14 @@ def test_filters_are_made_for_each_half_and_for_the_whole() -> None:
     assert "one effect" in null.test(days_of(gaussian([8], PERIODS, 3))).blocks
 
 
+def test_a_directed_statistic_replaces_no_other() -> None:
+    def factory(_: Reference) -> Directed:
+        return lambda _: {"lane": 1.0}
+
+    with pytest.raises(ValueError, match="statistics of one name: lane"):
+        Null(SEVERAL, days_of(gaussian([7], 41, 3)), PERIODS, speeds=True, directed=factory)
+
+
 def chances(*, anew: bool) -> Array:
     """Of plain data, with filters made for each half, or once from all days."""
     found: list[float] = []

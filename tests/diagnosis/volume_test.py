@@ -70,17 +70,17 @@ def proposed(layout: DetectorLayout, ways: Mapping[Way, float], counts: Counts) 
 
 def test_one_edge_is_its_squared_z() -> None:
     found = directed(a_layout(("a",)), {("a", "x"): 400.0}, {"a": (60.0, 20.0)})
-    assert found == {"demand": pytest.approx(9.0), "turning": 0.0}
+    assert found == {"best origin": pytest.approx(9.0), "best turn": 0.0}
 
 
 def test_a_vehicle_that_is_counted_twice_counts_once() -> None:
     layout, counts = a_layout(("a",), ("b",)), {"a": (60.0, 20.0), "b": (60.0, 20.0)}
     # 1' C^-1 1 with correlation 1 - _ALONE between them: 2 / (2 - _ALONE), and not 2.
-    shared = directed(layout, {("a", "b"): 400.0}, counts)["demand"]
+    shared = directed(layout, {("a", "b"): 400.0}, counts)["best origin"]
     assert shared == pytest.approx(9.0 * 2 / (2 - THRESHOLDS.alone))
     # Two edges of one origin that share no vehicle are two observations.
     apart = directed(a_layout(("a", "c")), {("o", "a"): 400.0, ("o", "c"): 400.0},
-                     {"a": (60.0, 20.0), "c": (60.0, 20.0)})["demand"]  # fmt: skip
+                     {"a": (60.0, 20.0), "c": (60.0, 20.0)})["best origin"]  # fmt: skip
     assert apart == pytest.approx(2 * 9.0)
 
 
@@ -88,7 +88,7 @@ def test_counts_that_share_vehicles_and_disagree_are_no_demand() -> None:
     # One detector has 60 more and the other 60 fewer of the same vehicles: strength 0.
     counts = {"a": (60.0, 20.0), "b": (-60.0, 20.0)}
     found = directed(a_layout(("a",), ("b",)), {("a", "b"): 400.0}, counts)
-    assert found["demand"] == pytest.approx(0.0, abs=1e-9)
+    assert found["best origin"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_exits_towards_another_light_are_counted_there_too() -> None:
@@ -99,7 +99,7 @@ def test_exits_towards_another_light_are_counted_there_too() -> None:
     for values in (distance.difference["lane"], distance.z["lane"]):
         values[1, row] = 0.0  # nothing at the stop line of b
     found = Volume(layout, routes({("a", "b"): 400.0}), THRESHOLDS).directed(distance)
-    assert found["demand"] == pytest.approx(9.0)
+    assert found["best origin"] == pytest.approx(9.0)
 
 
 WAYS: dict[Way, float] = {
@@ -138,7 +138,7 @@ def test_a_planted_turn_comes_out_with_its_share(way: Way, share: float) -> None
     assert first.fixed == (("from_edge", way[0]), ("to_edge", way[1]))
     assert first.levels[0][0] == pytest.approx(share, abs=1e-6)
     sizes = directed(SITE, WAYS, changed(more))
-    assert sizes["turning"] > sizes["demand"]
+    assert sizes["best turn"] > sizes["best origin"]
 
 
 @pytest.mark.parametrize(("origin", "behind"), [("a", 80.0), ("b", 80.0), ("b", 20.0)])
@@ -172,8 +172,8 @@ def test_lanes_tell_from_where_vehicles_turn_elsewhere(origin: str, behind: floa
     assert first.levels == tuple((share,) for share in dict.fromkeys((0.4, behind / 200.0)))
     # Two lanes, 80 more and 80 fewer, errors of 14: 2 (80 / 14)^2 beside what the exits say.
     counted = a_distance(layout, exits)
-    gain = Volume(layout, routes(ways), THRESHOLDS).directed(distance)["turning"]
-    alone = Volume(layout, routes(ways), THRESHOLDS).directed(counted)["turning"]
+    gain = Volume(layout, routes(ways), THRESHOLDS).directed(distance)["best turn"]
+    alone = Volume(layout, routes(ways), THRESHOLDS).directed(counted)["best turn"]
     assert gain - alone == pytest.approx(2 * (80.0 / 14.0) ** 2, rel=0.01)
 
 
@@ -190,7 +190,7 @@ def test_the_size_of_a_difference_is_that_of_chi_square_where_vehicles_come_by_c
     for _ in range(400):
         left, right = (generator.poisson(rate) - rate for rate in (200.0, 300.0))
         counts = {"a": (left + right, 500**0.5), "x": (left, 200**0.5), "y": (right, 300**0.5)}
-        sizes.append(directed(layout, ways, counts)["demand"])
+        sizes.append(directed(layout, ways, counts)["best origin"])
     assert 0.8 < np.mean(sizes) < 1.25  # 2 if each vehicle counted at both of its detectors
 
 
@@ -199,14 +199,14 @@ def test_edges_without_routes_do_no_harm(known: Mapping[Way, float]) -> None:
     layout = a_layout(("a", "b"), ("x",))
     counts = {"a": (60.0, 20.0), "b": (60.0, 20.0), "x": (-60.0, 20.0)}
     found = directed(layout, known, counts)
-    assert set(found) == {"demand", "turning"}
+    assert set(found) == {"best origin", "best turn"}  # "turning" are measured turning counts
     assert all(np.isfinite(value) and value >= 0 for value in found.values())
     proposed(layout, known, counts)
 
 
 @pytest.mark.parametrize("layout", [a_layout(()), a_layout((), ("x",)), SITE])
 def test_without_counts_there_is_nothing_to_tell(layout: DetectorLayout) -> None:
-    assert directed(layout, WAYS, {}) == {"demand": 0.0, "turning": 0.0}
+    assert directed(layout, WAYS, {}) == {"best origin": 0.0, "best turn": 0.0}
     assert proposed(layout, WAYS, {}) == []
 
 

@@ -531,11 +531,14 @@ class Volume:
         self._routes = routes
 
     def directed(self, distance: Distance) -> dict[str, float]:
-        """Return the squared standardised sizes of the best origin and of the best turn."""
+        """Return the squared standardised sizes of the best origin and of the best turn.
+
+        Their names are not those of hypotheses: "turning" is a block, of measured turning counts.
+        """
         counts = self._counts(distance)
         return {
-            "demand": max((row[0] for row in self._origins(counts)), default=0.0),
-            "turning": max((row[0] for row in self._turns(counts, distance)), default=0.0),
+            "best origin": max((row[0] for row in self._origins(counts)), default=0.0),
+            "best turn": max((row[0] for row in self._turns(counts, distance)), default=0.0),
         }
 
     def hypotheses(self, distance: Distance) -> list[Hypothesis]:

@@ -172,12 +172,18 @@ def _statistics(distance: Distance, directed: Directed | None, more: float) -> d
     """Return the tested statistics, each with `more` added.
 
     They are the distances of blocks, the largest single ones, and directed ones.
+
+    Raises:
+        ValueError: If a directed statistic has the name of another one, which it would replace.
     """
     values = dict(distance.parts)
     for name in ("lane", "time"):
         values[f"{name}, largest"] = float(np.abs(distance.z[name]).max(initial=0.0)) ** 2
     if directed is not None:
-        values |= directed(distance)
+        further = directed(distance)
+        if twice := sorted(values.keys() & further.keys()):
+            raise ValueError(f"statistics of one name: {', '.join(twice)}")
+        values |= further
     return {name: value + more for name, value in values.items()}
 
 
