@@ -222,6 +222,26 @@ def test_rows_that_are_delivered_late_are_sorted(rows: list[int], read: Read) ->
     only(findings, f"{len(rows)} rows are earlier than the row before them; they were sorted")
 
 
+@pytest.mark.parametrize("packets", [[(40, 45)], [(40, 45), (200, 230)]])
+def test_packets_that_are_delivered_late_are_sorted(
+    packets: list[tuple[int, int]], read: Read
+) -> None:
+    ons = of("s") & (pl.col("event") == "on")
+    number = ons.cum_sum().over("period_id")
+    delivered_s = pl.col("time_s")
+    for ends in packets:
+        packet = ons & number.is_between(*ends)
+        end_s = pl.col("time_s").filter(packet).max().over("period_id")
+        delivered_s = pl.when(packet).then(end_s + 75.0).otherwise(delivered_s)
+    found, findings = read(
+        changes={
+            "detections": lambda f: f.sort("period_id", delivered_s, maintain_order=True)
+        }
+    )
+    assert found.hash == recording().hash
+    only(findings, f"{len(packets)} rows are earlier than the row before them; they were sorted")
+
+
 def test_a_clock_set_back_shortly_before_the_end_is_an_error(read: Read) -> None:
     """Two rows of each stream follow."""
 

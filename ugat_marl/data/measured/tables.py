@@ -698,9 +698,9 @@ def refuse_set_back(
 ) -> None:
     """Refuse streams whose clock was set back.
 
-    Three other cases are accepted. Rows out of order step back many times. A row that was delivered
-    late steps back alone: the next row is ahead again. A file with swapped pieces steps back, but
-    ends before it began, so no time occurs twice; all of it is within its period.
+    Three other cases are accepted. Rows out of order step back many times. Rows that were delivered
+    late fill a gap, and the clock is right again behind them. A file with swapped pieces steps
+    back, but ends before it began, so no time occurs twice; all of it is within its period.
 
     Args:
         path: File of the rows.
@@ -745,9 +745,16 @@ def clock_steps(clock: NDArray[np.float64], begin_s: float = -np.inf) -> NDArray
         begin_s: Start of the period, s: a row before it is no late one.
     """
     steps = np.flatnonzero(np.diff(clock) < -CLOCK_JUMP_S) + 1  # others are late rows
-    following = np.append(clock, np.inf)[steps + 1]
-    late = following >= clock[steps - 1]  # behind a late row the clock is right again
+    late = np.array([_are_late(clock, step) for step in steps], bool)
     return steps[~late | (clock[steps] < begin_s)]
+
+
+def _are_late(clock: NDArray[np.float64], step: int) -> bool:
+    """Return True if rows from `step` on were delivered late: all in one gap of the rows before."""
+    right = np.append(clock[step:] >= clock[step - 1], True)  # the end of the file counts as right
+    own = clock[step : step + int(right.argmax())]
+    before = clock[:step]
+    return not ((before > own.min()) & (before < own.max())).any() and len(own) < len(before)
 
 
 def _steps_back(stream: NDArray[np.int64], clock: NDArray[np.float64]) -> NDArray[np.int64]:
