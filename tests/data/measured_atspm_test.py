@@ -432,6 +432,11 @@ def test_a_recording_that_became_a_log_is_the_same_recording(
     ("old", "new", "message"),
     [
         ('tls = "C"', 'tls = "D"', "'D' is not a traffic light of the network; it has C"),
+        (
+            "4 = [1] }",
+            '4 = [1] }\nconstant = { 1 = "g" }',
+            r"link 1 is under \[devices.constant\] and in a phase or an overlap",
+        ),
         ("4 = [1]", "4 = []", r"nothing says what the links 1 of 'C' show.*devices.constant"),
         ("4 = [1]", "4 = [1, 2]", "link 2 does not exist; 'C' has the links 0 to 1"),
         ("channel = 6", "channel = 5", "channel 5 is mapped twice"),

@@ -234,9 +234,7 @@ def test_packets_that_are_delivered_late_are_sorted(
         end_s = pl.col("time_s").filter(packet).max().over("period_id")
         delivered_s = pl.when(packet).then(end_s + 75.0).otherwise(delivered_s)
     found, findings = read(
-        changes={
-            "detections": lambda f: f.sort("period_id", delivered_s, maintain_order=True)
-        }
+        changes={"detections": lambda f: f.sort("period_id", delivered_s, maintain_order=True)}
     )
     assert found.hash == recording().hash
     only(findings, f"{len(packets)} rows are earlier than the row before them; they were sorted")

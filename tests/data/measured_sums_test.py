@@ -66,6 +66,16 @@ def test_what_is_written_is_what_is_read(
     assert not after.has_events
 
 
+def test_counts_without_speeds_keep_their_hash(
+    tmp_path: Path, scenario: Scenario, network: Network
+) -> None:
+    given = sums()
+    assert given.counts is not None
+    bare = replace(given, counts=given.counts.with_columns(mean_speed_mps=pl.lit(None, pl.Float64)))
+    after = read_measured(write_measured(bare, tmp_path / "bare", csv=True), scenario, network)
+    assert after.hash == bare.hash != given.hash
+
+
 def test_counts_without_the_new_columns_keep_their_hash(
     tmp_path: Path, scenario: Scenario, network: Network
 ) -> None:
@@ -102,12 +112,14 @@ def test_counts_without_the_new_columns_keep_their_hash(
         ("turning", "to_edge", "C_E", "no vehicle can turn from 'S_C' to 'C_E' at a traffic light"),
         ("turning", "from_edge", "C_N", "'C_N' leads to no traffic light"),
         ("turning", "count", "1.5", "is not a whole number"),
+        ("turning", "count", "9000", "is more than one vehicle per second and lane; write the"),
         ("turning", "period_id", "day9", "is not listed in periods.csv"),
         ("turning", "end_s", "0", "is not after begin_s"),
         ("travel_times", "to_edge", "X_Y", "is not an edge of the network"),
         ("travel_times", "from_m", "9000", "lies beyond its from_edge; write the distance"),
         ("travel_times", "to_m", "-1", "lies beyond its to_edge"),
         ("travel_times", "travel_s", "0", "is not above 0; write the time"),
+        ("travel_times", "travel_s", "0.67", "is shorter than at 70 m/s; write seconds, not min"),
     ],
 )
 def test_impossible_rows_are_refused_with_their_place_and_the_way_out(
@@ -126,6 +138,21 @@ def test_impossible_rows_are_refused_with_their_place_and_the_way_out(
     assert message in text
     assert f"{file}.csv, line 4" in text
     assert "\n" not in text
+
+
+@pytest.mark.parametrize("column", ["occupancy", "mean_speed_mps"])
+def test_a_column_of_zeros_was_not_measured(
+    column: str, written: Path, scenario: Scenario, network: Network
+) -> None:
+    (written / CSV_HASHES).unlink()
+    path = written / "counts.csv"
+    whole = pl.read_csv(path)
+    whole.with_columns(pl.lit(0.0).alias(column)).write_csv(path)
+    with pytest.raises(MeasuredDataError, match=f"{column} '0.0' is 0 wherever vehicles were"):
+        read_measured(written, scenario, network)
+    few = pl.when(pl.int_range(pl.len()) % 2 == 0).then(0.0).otherwise(column)
+    whole.with_columns(few.alias(column)).write_csv(path)
+    read_measured(written, scenario, network)
 
 
 def test_a_turn_that_is_there_twice_is_refused(

@@ -949,6 +949,8 @@ def test_a_zero_before_all_dates_is_an_error() -> None:
         ("lanes with speeds", "10,{lane},2,1,80", "mean_speed_mps '80.0' is more than 70 m/s"),
         ("trajectories", "v,10,{lane},99999,5", "position_m '99999.0' is beyond the end of"),
         ("trajectories", "v,10,{lane},50,900", "speed_mps '900.0' is more than 70 m/s"),
+        ("tracks with lengths", "v,10,{lane},50,9,450", "length_m '450.0' is not above 0 and up"),
+        ("tracks with lengths", "v,10,{lane},50,9,0", "length_m '0.0' is not above 0 and up to"),
     ],
 )
 def test_moments_that_no_street_shows_are_refused(
@@ -961,8 +963,9 @@ def test_moments_that_no_street_shows_are_refused(
         "lanes": "period_id,time_s,lane_id,vehicles,halting",
         "lanes with speeds": "period_id,time_s,lane_id,vehicles,halting,mean_speed_mps",
         "trajectories": "period_id,vehicle_id,time_s,lane_id,position_m,speed_mps",
+        "tracks with lengths": "period_id,vehicle_id,time_s,lane_id,position_m,speed_mps,length_m",
     }
-    table = tables.TRAJECTORIES if name == "trajectories" else tables.LANES
+    table = tables.LANES if name.startswith("lanes") else tables.TRAJECTORIES
     path = tmp_path / f"{name}.csv"
     path.write_text(f"{columns[name]}\np,{row.format(lane=lane)}\n")
     files: Any = SimpleNamespace(

@@ -39,7 +39,8 @@ class Record:
         duration_s: Length of a day in s.
         day_to_day: Standard deviation of the whole demand of a day, as a share of its mean.
         same_demand: Use the scenario's own vehicles on every day, instead of drawing each day anew.
-        detector_length_m: Length of the detection zones in m; 0 for points.
+        detector_length_m: Length of the detection zones in m, less near the start of a lane; 0 for
+            points.
         speeds: Measure speeds and lengths at the detectors.
         lanes: Also record vehicles, halting and mean speed per lane and second.
         trajectories: Also record the position of every vehicle at every second.

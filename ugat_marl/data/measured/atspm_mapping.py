@@ -238,9 +238,15 @@ def _check_devices(
             raise MeasuredDataError(
                 f"{where}: the traffic light {device.tls!r} is mapped twice; map it once"
             )
-        mapped = set(device.constant)
+        mapped: set[int] = set()
         for links in (*device.phases.values(), *device.overlaps.values()):
             mapped |= {*links.green, *links.permissive, *links.flashing}
+        if both := sorted(mapped & set(device.constant)):
+            raise MeasuredDataError(
+                f"{where}: link {both[0]} is under [devices.constant] and in a phase or an "
+                "overlap, which it would never follow; name it once"
+            )
+        mapped |= set(device.constant)
         width = widths[device.tls]
         named = mapped | set(device.on_red)
         if unknown := sorted(link for link in named if not 0 <= link < width):

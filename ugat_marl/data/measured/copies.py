@@ -12,7 +12,7 @@ from ugat_marl.errors import MeasuredDataError
 from ugat_marl.scenarios import Period
 
 FEWEST = 20
-"""Smallest number of equal rows with vehicles, or of detections, that counts as a copy."""
+"""Smallest number of vehicles, or of rows with vehicles, that tells something."""
 TWICE = (
     "one recording would count twice; let periods of one day not overlap, and give each day its "
     "own rows"

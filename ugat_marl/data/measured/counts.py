@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import polars as pl
 
-from ugat_marl.data.measured.copies import refuse_copies
+from ugat_marl.data.measured.copies import FEWEST, refuse_copies
 from ugat_marl.data.measured.passages import FASTEST_MPS
 from ugat_marl.data.measured.tables import (
     COUNTS,
@@ -60,7 +61,9 @@ def counts_of(
     )
     frame = _checked_intervals(path, frame, periods, ("detector_id",), "its detector", findings)
     _refuse_units(path, frame)
-    _check_rates(path, frame, detectors, findings)
+    lanes = {detector.id: len(detector.lanes) for detector in detectors}
+    served = pl.col("detector_id").replace_strict(lanes, return_dtype=pl.Float64)
+    _check_rates(path, frame, served, findings)
     more = [name for name in COUNTS.optional if frame[name].count()]
     return frame.select(*COUNTS.columns, *more)
 
@@ -154,16 +157,17 @@ def _refuse_overlaps(path: Path, frame: pl.DataFrame, keys: tuple[str, ...], own
         )
 
 
-def _check_rates(
-    path: Path,
-    frame: pl.DataFrame,
-    detectors: Sequence[Detector],
-    findings: list[Finding],
-) -> None:
-    """Refuse counts that no lane can serve; add a finding on doubtful ones."""
-    lanes = {detector.id: len(detector.lanes) for detector in detectors}
+def _check_rates(path: Path, frame: pl.DataFrame, lanes: pl.Expr, findings: list[Finding]) -> None:
+    """Refuse counts that no lane can serve; add a finding on doubtful ones.
+
+    Args:
+        path: The file.
+        frame: Its rows.
+        lanes: Number of lanes that serve the vehicles of each row.
+        findings: Findings.
+    """
     length = pl.col("end_s") - pl.col("begin_s")
-    served = pl.col("detector_id").replace_strict(lanes, return_dtype=pl.Float64) * length
+    served = lanes * length
     refuse(
         path,
         frame.filter(pl.col("count") > 1 + MOST_PER_S * served),
@@ -183,7 +187,7 @@ def _check_rates(
 
 
 def _refuse_units(path: Path, frame: pl.DataFrame) -> None:
-    """Refuse occupancies and mean speeds in other units."""
+    """Refuse occupancies and mean speeds in other units, and zeros for what was not measured."""
     occupancy, speed = pl.col("occupancy"), pl.col("mean_speed_mps")
     for bad, column, complaint, way_out in (
         (
@@ -201,6 +205,12 @@ def _refuse_units(path: Path, frame: pl.DataFrame) -> None:
         ),
     ):
         refuse(path, frame.filter(bad), column, complaint, way_out)
+    seen = frame.filter(pl.col("count") > 0)
+    for column in ("occupancy", "mean_speed_mps"):
+        if seen["count"].sum() >= FEWEST and (seen[column].max() or 0.0) == 0.0:
+            zeros = seen.filter(pl.col(column) == 0)
+            way_out = "leave the cells empty if it was not measured"
+            refuse(path, zeros, column, "is 0 wherever vehicles were counted", way_out)
 
 
 def turning_of(
@@ -223,16 +233,14 @@ def turning_of(
         MeasuredDataError: A period is unknown, no vehicle can turn so, or an interval or a number
             is impossible.
     """
-    turns = {
-        (edge, link.to_edge)
-        for intersection in network.intersections
-        for link in intersection.links
-        for edge in (network.lanes[link.from_lane].edge,)
-    }
+    lanes: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for intersection in network.intersections:
+        for link in intersection.links:
+            lanes[network.lanes[link.from_lane].edge, link.to_edge].add(link.from_lane)
     _refuse_edges(path, frame, ("from_edge", "to_edge"), network)
     for row in frame.iter_rows(named=True):
-        if (row["from_edge"], row["to_edge"]) not in turns:
-            ways = sorted(to for edge, to in turns if edge == row["from_edge"])
+        if (row["from_edge"], row["to_edge"]) not in lanes:
+            ways = sorted(to for edge, to in lanes if edge == row["from_edge"])
             leads = f"{row['from_edge']!r} leads to {', '.join(ways[:8])}" if ways else (
                 f"{row['from_edge']!r} leads to no traffic light"
             )  # fmt: skip
@@ -242,6 +250,8 @@ def turning_of(
             )
     keys = ("from_edge", "to_edge")
     frame = _checked_intervals(path, frame, periods, keys, "its turn", findings)
+    numbers = [float(len(lanes[turn])) for turn in frame.select(keys).iter_rows()]
+    _check_rates(path, frame, pl.lit(pl.Series(numbers, dtype=pl.Float64)), findings)
     return frame.select(*TURNING.columns)
 
 
@@ -254,8 +264,7 @@ def travel_times_of(path: Path, frame: pl.DataFrame, network: Network) -> pl.Dat
         network: Network of the scenario.
 
     Raises:
-        MeasuredDataError: An edge is unknown, a place lies beyond its edge, or a time is not above
-            0.
+        MeasuredDataError: An edge is unknown, a place lies beyond its edge, or a time is too short.
     """
     _refuse_edges(path, frame, ("from_edge", "to_edge"), network)
     lengths = {lane.edge: lane.length_m for lane in network.lanes.values()}
@@ -274,6 +283,18 @@ def travel_times_of(path: Path, frame: pl.DataFrame, network: Network) -> pl.Dat
         "travel_s",
         "is not above 0",
         "write the time from the first to the second place, in s",
+    )
+    # At least the rest of the first edge and the part of the last one; more lies between them.
+    begin, end = pl.col("from_m"), pl.col("to_m")
+    length = pl.col("from_edge").replace_strict(lengths, return_dtype=pl.Float64)
+    same = (pl.col("from_edge") == pl.col("to_edge")) & (end >= begin)
+    metres = pl.when(same).then(end - begin).otherwise(length - begin + end)
+    refuse(
+        path,
+        frame.filter(metres > FASTEST_MPS * pl.col("travel_s")),
+        "travel_s",
+        f"is shorter than at {FASTEST_MPS:g} m/s",
+        "write seconds, not minutes",
     )
     return frame.select(*TRAVEL_TIMES.columns)
 

@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ugat_marl.data.measured.copies import FEWEST
 from ugat_marl.data.measured.values import Finding, MeasuredData
 from ugat_marl.errors import listed
 from ugat_marl.scenarios import (
@@ -25,8 +26,6 @@ from ugat_marl.scenarios import (
     Period,
 )
 
-FEWEST = 20
-"""Least number of vehicles that tell something."""
 MOST_ON_RED = 0.6
 """Largest plausible share of a lane's vehicles that leave on red."""
 LONGEST_ZONE_M = 60.0

@@ -18,7 +18,12 @@ from ugat_marl.data.measured.copies import refuse_copies
 from ugat_marl.data.measured.counts import counts_of, travel_times_of, turning_of
 from ugat_marl.data.measured.coverage import coverage
 from ugat_marl.data.measured.local_time import LocalClock, require_time_zone
-from ugat_marl.data.measured.passages import FASTEST_MPS, MOST_UNPAIRED, passages_of
+from ugat_marl.data.measured.passages import (
+    FASTEST_MPS,
+    LONGEST_M,
+    MOST_UNPAIRED,
+    passages_of,
+)
 from ugat_marl.data.measured.tables import (
     PERIOD,
     ROW,
@@ -313,6 +318,9 @@ def _refuse_impossible(
         refuse(path, far, "position_m", "is beyond the end of the lane", "correct lane or position")
         fast = frame.filter(pl.col("speed_mps") > FASTEST_MPS)
         refuse(path, fast, "speed_mps", f"is more than {FASTEST_MPS:g} m/s", "write m/s")
+        if "length_m" in frame.columns:
+            wrong = frame.filter((pl.col("length_m") <= 0) | (pl.col("length_m") > LONGEST_M))
+            refuse(path, wrong, "length_m", f"is not above 0 and up to {LONGEST_M:g} m", "write m")
         return
     fast = frame.filter(pl.col("mean_speed_mps") > FASTEST_MPS)
     refuse(path, fast, "mean_speed_mps", f"is more than {FASTEST_MPS:g} m/s", "write m/s")

@@ -745,7 +745,7 @@ def clock_steps(clock: NDArray[np.float64], begin_s: float = -np.inf) -> NDArray
         begin_s: Start of the period, s: a row before it is no late one.
     """
     steps = np.flatnonzero(np.diff(clock) < -CLOCK_JUMP_S) + 1  # others are late rows
-    late = np.array([_are_late(clock, step) for step in steps], bool)
+    late = np.array([_are_late(clock, int(step)) for step in steps], bool)
     return steps[~late | (clock[steps] < begin_s)]
 
 

@@ -124,6 +124,8 @@ class MeasuredData:
             if frame is not None:
                 numbers = selectors.numeric().cast(pl.Float64).fill_nan(None)
                 table = frame.select(sorted(frame.columns)).with_columns(numbers)
+                # A file holds no column without values.
+                table = table.select(name for name in table.columns if table[name].count())
                 times = selectors.by_name("time_s", "begin_s", "end_s", require_all=False)
                 digest.update(table.with_columns(times.round(3) + 0.0).write_csv().encode())
         return digest.hexdigest()

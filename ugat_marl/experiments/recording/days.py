@@ -145,7 +145,8 @@ def record(
         duration_s: Length of a day in s; None for the scenario's own.
         same_demand: True to use the scenario's own vehicles every day, False to draw new ones.
         day_to_day: Standard deviation of the whole demand of a day, as a share of its mean.
-        detector_length_m: Length of the detection zones in m; 0 for points.
+        detector_length_m: Length of the detection zones in m, less near the start of a lane; 0 for
+            points.
         speeds: True if the detectors measure speeds and lengths.
         lanes: True to keep vehicles, halting vehicles and mean speed per lane and second.
         trajectories: True to keep the position of every vehicle at every second.
