@@ -56,6 +56,25 @@ def test_a_flow_by_chance_that_ended_before_the_episode_is_left_out() -> None:
     assert [item.get("id") for item in vehicles(demand_as_vehicles(scenario))] == ["t"]
 
 
+@pytest.mark.parametrize(
+    ("text", "departs"),
+    [
+        ('<vehicle id="v" depart="begin"><route edges="west1_A1 A1_east1"/></vehicle>', [3600]),
+        ('<trip id="t" depart="begin" from="west1_A1" to="A1_east1"/>', [3600]),
+        (
+            '<flow id="f" begin="begin" end="3640" number="4" from="west1_A1" to="A1_east1"/>',
+            [3600, 3610, 3620, 3630],
+        ),
+    ],
+)
+def test_the_word_begin_is_that_of_the_episode(text: str, departs: list[float]) -> None:
+    scenario = with_routes(text, begin_s=3600.0)
+    found = [float(item.get("depart", "")) for item in vehicles(demand_as_vehicles(scenario))]
+    assert found == departs
+    drawn = [float(item.get("depart", "")) for item in vehicles(draw_day(scenario, 5))]
+    assert all(3600 <= depart < 3640 for depart in drawn)
+
+
 def test_of_districts_it_is_said_that_ways_differ() -> None:
     districts = "".join(
         f'<taz id="{name}" edges="{edges}"/>'

@@ -357,8 +357,12 @@ def test_a_network_with_routes(files: Path, tmp_path: Path) -> None:
 def test_other_vehicles_for_a_configuration(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert made(tmp_path / "a", "--sumo", files / "city.sumocfg", "--vph", "120") == 0
+    configuration = files / "city.sumocfg"
+    text = configuration.read_text().replace("<begin", '<scale value="3"/><begin')
+    configuration.write_text(text)
+    assert made(tmp_path / "a", "--sumo", configuration, "--vph", "120") == 0
     said = " ".join("".join(capsys.readouterr()).split())
+    assert "scale = 3 left out: it is that of its own vehicles" in said
     assert "note: city.sumocfg: its vehicles are replaced, so its additional files are left" in said
     scenario = read_scenario(tmp_path / "a")
     assert scenario.additional == ()

@@ -311,11 +311,11 @@ def _test_content(
 
 
 def _holds_single_vehicles(document: Document) -> bool:
-    """Return True if the file holds nothing but single vehicles with their own edges."""
+    """Return True if the file holds nothing but single vehicles with their own edges and times."""
     singles = OwnEdges()
     for tag in document.scan():
         singles.read(tag)
-        if singles.lost:
+        if singles.lost or _begins_with_episode(tag.attributes):
             return False
     return singles.ended()
 
@@ -412,15 +412,18 @@ def _children(document: Document, tags: frozenset[str]) -> Iterator[list[str]]:
 
 
 def _from_begin(documents: Iterable[Document], begin_s: float) -> tuple[Document, ...]:
-    """Return the files with no flow with a probability that begins before the episode.
+    """Return the files with the begin of the episode where duarouter needs it.
 
-    duarouter hangs on such a flow, so its begin is moved to the episode's. That changes nothing in
-    the episode, since departures in each second are independent. A flow that also ends before the
-    episode is left out.
+    duarouter lets every vehicle of a flow depart at "begin", so the word is replaced by its time.
+    And it hangs on a flow with a probability that begins before the episode, so its begin is moved
+    to the episode's. That changes nothing in the episode, since departures in each second are
+    independent. A flow that also ends before the episode is left out.
     """
 
     def delay(part: ET.Element) -> None:
         for element in list(part):
+            for key in _begins_with_episode(element.attrib):
+                element.set(key, f"{begin_s:.3f}")
             if _is_early(element.tag, element.attrib, begin_s):
                 element.set("begin", f"{begin_s:.3f}")
                 if "end" in element.attrib and parse_time(element.attrib["end"]) < begin_s:
@@ -428,10 +431,18 @@ def _from_begin(documents: Iterable[Document], begin_s: float) -> tuple[Document
 
     return tuple(
         document.changed(delay)
-        if any(_is_early(tag.name, tag.attributes, begin_s) for tag in document.scan())
+        if any(
+            _begins_with_episode(tag.attributes) or _is_early(tag.name, tag.attributes, begin_s)
+            for tag in document.scan()
+        )
         else document
         for document in documents
     )
+
+
+def _begins_with_episode(attributes: Mapping[str, str]) -> list[str]:
+    """Return the attributes of a vehicle or flow that hold the word "begin" for a time."""
+    return [key for key in ("depart", "begin") if attributes.get(key) == "begin"]
 
 
 def _is_early(name: str, attributes: Mapping[str, str], begin_s: float) -> bool:

@@ -118,6 +118,10 @@ def _configured(
         network = _network_of(given)
         begin_s, duration_s = given.times()
         settings = {"begin_s": begin_s, "duration_s": duration_s, **given.physics()}
+        if (scale := settings["sumo"].pop("scale", None)) is not None:
+            reporter.say(
+                f"note: {path.name}: scale = {scale} left out: it is that of its own vehicles"
+            )
         routes = additional = ()
         if left_out := given.names("additional-files"):
             reporter.say(
