@@ -41,6 +41,7 @@ from ugat_marl.scenarios import (
     write_plans,
     yellow_notes,
 )
+from ugat_marl.scenarios.importers.utdf import _matched
 from ugat_marl.scenarios.signal_plans import phase_times
 
 LEFTS_FIRST = (  # two rings, two barriers: lefts before through, of unequal length
@@ -713,6 +714,23 @@ def test_two_lights_need_a_word_on_which_is_which(tmp_path: Path) -> None:
     network = Network.read(load_scenario("grid2x2-v1"))
     with pytest.raises(ScenarioError, match=r"which intersection is which light\? Give --lights"):
         read_utdf(synchro(tmp_path), network, {})
+
+
+@pytest.mark.parametrize(
+    ("lights", "matched"),
+    [
+        ({}, {"A": "A", "B": "B"}),
+        ({"5": "C"}, {"A": "A", "B": "B", "5": "C"}),
+        ({"5": "B"}, {"A": "A", "5": "B"}),
+        ({"B": "C"}, {"A": "A", "B": "C"}),
+    ],
+)
+def test_ids_that_are_the_same_need_no_word(
+    lights: dict[str, str], matched: dict[str, str]
+) -> None:
+    nodes: dict[str, Any] = dict.fromkeys("AB5")
+    known: dict[str, Any] = dict.fromkeys("ABC")
+    assert _matched(nodes, known, lights, Path("plan.csv")) == matched
 
 
 def test_a_later_plan_of_another_light_keeps_the_earlier_one() -> None:

@@ -61,7 +61,8 @@ class Plan:
         seeds: Number of episodes of the policy.
         first_seed: Seed of the first episode; the default is none of those that `evaluate` plays.
         apply: Table of plans, or combined UTDF file of Synchro.
-        lights: Lights of the intersections of a UTDF file, as INTID=LIGHT.
+        lights: Lights of the intersections of a UTDF file, as INTID=LIGHT; not needed where both
+            ids are the same.
         force: Replace a table or scenario of the name --out.
     """
 

@@ -61,8 +61,8 @@ def read_utdf(
     Args:
         path: The file.
         network: The network.
-        lights: Intersection of the file (INTID) to SUMO's id of its light. Empty if the ids are the
-            same, or there is one of each.
+        lights: Intersection of the file (INTID) to SUMO's id of its light. Other intersections are
+            the lights of the same id. Empty also if there is one of each.
 
     Returns:
         The plans, and notes for the user.
@@ -159,9 +159,12 @@ def _matched(
                 f"--lights {name}={light}: {light!r} is not an agent of the scenario; its agents "
                 f"are {', '.join(known)}"
             )
+    taken = set(lights.values())
+    same = {
+        name: name for name in nodes if name in known and name not in lights and name not in taken
+    }
     if lights:
-        return dict(lights)
-    same = {name: name for name in nodes if name in known}
+        return {**same, **lights}
     if not same and len(nodes) == len(known) == 1:
         same = dict(zip(nodes, known, strict=True))
     if not same:
