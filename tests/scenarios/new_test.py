@@ -112,6 +112,19 @@ def test_rates_and_shares_are_those_asked_for() -> None:
     assert [d.depart_s for d in drives] == sorted(d.depart_s for d in drives)
 
 
+def test_an_entry_that_leads_out_only_past_a_junction_twice_has_vehicles() -> None:
+    """From `in`, nobody may turn into `out` but on the way back from a loop."""
+    streets = Streets(
+        {"in": "a", "there": "b", "back": "c", "out": "b", "on": "d", "off": "e"},
+        {"in": "b", "there": "c", "back": "b", "out": "x", "on": "e", "off": "y"},
+        {"in": {"s": ("there",)}, "there": {"r": ("back",)}, "back": {"r": ("out",)},
+         "on": {"s": ("off",)}},
+        ("in", "on"), frozenset({"out", "off"}),
+    )  # fmt: skip
+    routes = {drive.route for drive in walked(streets, 300, (0.4, 0.2, 0.4), 600, 5)}
+    assert routes == {("in", "there", "back", "out"), ("on", "off")}
+
+
 def test_walks_leave_the_network_and_pass_no_junction_twice(tmp_path: Path) -> None:
     assert made(tmp_path / "a", "--grid", "3x3", "--vph", "300", "--duration-s", "600") == 0
     root = parse_xml((tmp_path / "a" / "network.net.xml").read_bytes(), "net")

@@ -117,11 +117,12 @@ def _configured(
     else:
         network = _network_of(given)
         begin_s, duration_s = given.times()
-        settings = {"begin_s": begin_s, "duration_s": duration_s, **given.physics()}
-        if (scale := settings["sumo"].pop("scale", None)) is not None:
+        physics = given.physics()
+        if (scale := physics["sumo"].pop("scale", None)) is not None:
             reporter.say(
                 f"note: {path.name}: scale = {scale} left out: it is that of its own vehicles"
             )
+        settings = {"begin_s": begin_s, "duration_s": duration_s, **physics}
         routes = additional = ()
         if left_out := given.names("additional-files"):
             reporter.say(

@@ -95,11 +95,18 @@ def walked(
     drives: list[Drive] = []
     due = 0
     for entry in streets.entries:
-        random = numpy_generator(seed, "entry", entry)
-        for number, moment in enumerate(poisson_arrivals(random, vph / 3600, length_s)):
-            due += 1
-            if route := _walk(streets, entry, table, random):
-                drives.append(Drive(f"{entry}_{number}", round(moment, 2), route))
+        for again in (False, True):  # some roads lead out only past a junction twice
+            random = numpy_generator(seed, "entry", entry)
+            moments = poisson_arrivals(random, vph / 3600, length_s)
+            own = [
+                Drive(f"{entry}_{number}", round(moment, 2), route)
+                for number, moment in enumerate(moments)
+                if (route := _walk(streets, entry, table, random, again=again))
+            ]
+            if own:
+                break
+        drives += own
+        due += len(moments)
     if not due:
         raise ScenarioError(
             f"nobody enters within {length_s:g} s at {vph:g} vehicles an hour; raise --vph or "
@@ -114,13 +121,30 @@ def walked(
 
 
 def _walk(
-    streets: Streets, entry: str, shares: Mapping[str, float], random: np.random.Generator
+    streets: Streets,
+    entry: str,
+    shares: Mapping[str, float],
+    random: np.random.Generator,
+    *,
+    again: bool,
 ) -> tuple[str, ...]:
-    """Draw a route from an entry to an exit that passes no junction twice; empty if none."""
+    """Draw a route from an entry to an exit; empty if none was found.
+
+    Args:
+        streets: Roads of the network.
+        entry: First road.
+        shares: Share of each turn.
+        random: Source of the draws.
+        again: True if it may pass a junction twice, and only no road.
+    """
+
+    def place(road: str) -> str:
+        return road if again else streets.end[road]
+
     for _ in range(_TRIES):
-        road, route, passed = entry, [entry], {streets.start[entry]}
-        while road not in streets.exits and streets.end[road] not in passed:
-            passed.add(streets.end[road])
+        road, route, passed = entry, [entry], set[str]() if again else {streets.start[entry]}
+        while road not in streets.exits and place(road) not in passed:
+            passed.add(place(road))
             turns = streets.ahead.get(road, {})
             possible = {turn: shares[turn] for turn in turns if shares.get(turn, 0) > 0}
             possible = possible or {turn: 1.0 for turn in turns if turn != "t"}
@@ -129,7 +153,7 @@ def _walk(
             roads = turns[weighted_choice(possible, random)]
             road = weighted_choice(dict.fromkeys(roads, 1.0), random)
             route.append(road)
-        if road in streets.exits and streets.end[road] not in passed:
+        if road in streets.exits and place(road) not in passed:
             return tuple(route)
     return ()
 
