@@ -19,6 +19,7 @@ import pytest
 from rich.console import Console
 
 from tests.crossroads import crossroads_with
+from tests.effects.effects_demand_test import with_routes
 from ugat_marl.__main__ import main
 from ugat_marl.cli.scenario_check import show
 from ugat_marl.effects import load_scenario
@@ -507,6 +508,13 @@ def test_roads_where_vehicles_wait_outside_are_named(single: Scenario) -> None:
     runs = [RuleEpisode("programme", 100, 1000, 500, 100, 500)]
     (text,) = problems(survey(crowded), runs, outside)
     assert f"they wait at {full} ({outside[full]})" in text
+
+
+def test_vehicles_of_an_early_flow_that_wait_outside_are_found(single: Scenario) -> None:
+    """SUMO counts the vehicles of a flow from the episode's begin on."""
+    flow = '<flow id="f" begin="0" end="{}" period="0.3" from="west1_A1" to="A1_east1"/>'
+    early = with_routes(flow.format(7200), begin_s=3600.0).with_duration(300)
+    assert left_outside(early, 1)["west1_A1"] > 300
 
 
 def test_the_command_prints_tables(

@@ -317,11 +317,10 @@ class DetectorSplash(_OfDetectors):
         return self._edited(period, detectors, thinned)
 
     def _chosen(self, name: str, other: str, seen: Passages) -> NDArray[np.bool_]:
-        times = np.where(np.isnan(seen.on_s), seen.off_s, seen.on_s)
         return np.array(
             [
                 hashed_uniform("splash", name, other, str(n), f"{time:.3f}") < self.share
-                for n, time in enumerate(times.tolist())
+                for n, time in enumerate(seen.seen_s.tolist())
             ],
             dtype=np.bool_,
         )

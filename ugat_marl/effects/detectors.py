@@ -91,10 +91,9 @@ class Undercount(DetectorEffect):
         """Leave out passages, chosen by a hash of the detector and their number and time."""
 
         def thinned(name: str, passages: Passages) -> Passages:
-            times = np.where(np.isnan(passages.on_s), passages.off_s, passages.on_s)
             kept = [
                 hashed_uniform("undercount", name, str(n), f"{time:.3f}") >= self.share
-                for n, time in enumerate(times.tolist())
+                for n, time in enumerate(passages.seen_s.tolist())
             ]
             return passages.at(np.array(kept, dtype=np.bool_))
 

@@ -17,6 +17,7 @@ from ugat_marl.scenarios import (
     IntersectionFacts,
     Scenario,
     Survey,
+    demand_as_vehicles,
     departures,
     run_program,
 )
@@ -111,6 +112,7 @@ def left_outside(scenario: Scenario, seed: int) -> Counter[str]:
     Raises:
         ScenarioError: SUMO failed; the message quotes SUMO.
     """
+    scenario = demand_as_vehicles(scenario)  # SUMO counts the vehicles of flows from its begin on
     with tempfile.TemporaryDirectory(prefix="ugat_marl-") as name:
         directory = Path(name) / "run"
         launch = launch_of(scenario, seed, directory, ())

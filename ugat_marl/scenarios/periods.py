@@ -94,8 +94,7 @@ class Passages:
         """Return all passages of several parts, sorted by time."""
         rows = [[x.on_s, x.off_s, x.speed_mps, x.length_m] for x in parts]
         whole = cls(*np.concatenate(rows, axis=1))
-        times = np.where(np.isnan(whole.on_s), whole.off_s, whole.on_s)
-        return whole.at(np.argsort(times, kind="stable"))
+        return whole.at(np.argsort(whole.seen_s, kind="stable"))
 
     @classmethod
     def together(cls, lanes: Sequence[Passages]) -> Passages:

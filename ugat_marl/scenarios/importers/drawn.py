@@ -132,9 +132,13 @@ class NetworkRanges:
             OptionError: A value is impossible.
         """
         for name, (least, most) in _LIMITS.items():
-            value = getattr(self, name)
-            bounds = value if isinstance(value, tuple) else (value, value)
-            if len(bounds) != 2 or not least <= bounds[0] <= bounds[1] <= most:
+            value: Any = getattr(self, name)
+            paired = isinstance(getattr(NetworkRanges, name), tuple)
+            if (isinstance(value, tuple) and len(value) == 2) != paired:
+                wanted = "the least and the largest value" if paired else "one number"
+                raise OptionError(f"{name} = {value}: give {wanted}")
+            bounds: Range = value if paired else (value, value)
+            if not least <= bounds[0] <= bounds[1] <= most:
                 raise OptionError(
                     f"{name} = {value}: give values from {least:g} to {most:g}, the least first"
                 )
