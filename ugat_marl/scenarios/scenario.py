@@ -122,7 +122,7 @@ class Scenario:
     def write(self, directory: Path) -> Path:
         """Write a scenario directory that SUMO and `read_scenario` can use.
 
-        Another scenario that is there already is replaced.
+        A scenario that is there already is replaced; files that only it names stay.
 
         Returns:
             `directory`.

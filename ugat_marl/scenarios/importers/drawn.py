@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -137,7 +137,7 @@ class NetworkRanges:
             if (isinstance(value, tuple) and len(value) == 2) != paired:
                 wanted = "the least and the largest value" if paired else "one number"
                 raise OptionError(f"{name} = {value}: give {wanted}")
-            bounds: Range = value if paired else (value, value)
+            bounds = cast(Range, value if paired else (value, value))
             if not least <= bounds[0] <= bounds[1] <= most:
                 raise OptionError(
                     f"{name} = {value}: give values from {least:g} to {most:g}, the least first"
