@@ -416,7 +416,7 @@ def test_other_vehicles_drive_at_the_times_of_the_configuration(
         (["--arterial", "0", "--vph", "100"], "--arterial 0"),
         (["--grid", "1x1", "--vph", "100", "--spacing-m", "5"], "50 to 5000 m"),
         (["--grid", "1x1", "--vph", "100", "--speed-mps", "nan"], "1 to 60 m/s"),
-        (["--grid", "1x1", "--vph", "1e9"], "1 to 100000"),
+        (["--grid", "1x1", "--vph", "1e9"], "above 0, up to 100000"),
         (["--grid", "1x1", "--vph", "0.001", "--duration-s", "60"], "nobody enters"),
         (
             ["--grid", "1x1", "--vph", "9999", "--duration-s", "5"],

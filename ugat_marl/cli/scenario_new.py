@@ -136,7 +136,9 @@ class ScenarioNew:
         require_numbers(0, draw=self.draw, seed=self.seed)
         for name, value in (("begin_s", self.begin_s), ("duration_s", self.duration_s)):
             if value is not None and not 0 <= value < math.inf:
-                raise OptionError(f"--{name.replace('_', '-')} {value}: give a finite number of seconds, 0 or more")
+                raise OptionError(
+                    f"{option_text(name)} {value}: give a finite number of seconds, 0 or more"
+                )
         decision_s = ControlSettings().decision_interval_s
         if self.duration_s is not None and self.duration_s < decision_s:
             raise OptionError(

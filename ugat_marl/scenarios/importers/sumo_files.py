@@ -89,27 +89,8 @@ def _configured(
     path: Path, folder: Path, link: bool, own_vehicles: bool, reporter: Reporter
 ) -> RoadFiles:
     given = SumoConfiguration(path)
-    if ignored := given.ignored():
-        reporter.say(
-            f"note: {path.name}: {', '.join(ignored)} left out: vehicles are never teleported or "
-            "given up, and the seed is that of the episode; traffic may differ from SUMO's own"
-        )
-    if lacking := given.lacking():
-        reporter.say(
-            f"note: {path.name}: {', '.join(lacking)} left out: an episode begins in an empty "
-            "network, and edges have no weights of their own; traffic differs from SUMO's own"
-        )
-    if times := given.physics().get("control"):
-        longer = ", ".join(f"{name} = {value:g}" for name, value in times.items())
-        reporter.say(
-            f"note: {path.name}: its steps do not divide the usual times of signals; {longer} "
-            "in their place"
-        )
-    if not given.has_end:
-        reporter.say(
-            f"note: {path.name}: it has no end, so an episode is one hour; write duration_s into "
-            "scenario.toml for another length"
-        )
+    for note in _differences(given):
+        reporter.say(f"note: {path.name}: {note}")
     if own_vehicles:
         scenario = read_scenario(path)
         network, routes, additional = scenario.network, scenario.routes, scenario.additional
@@ -152,6 +133,28 @@ def _configured(
             if document.path is not None and document.home is None
         },
     )
+
+
+def _differences(given: SumoConfiguration) -> Iterator[str]:
+    """Yield what an episode does not take from a configuration."""
+    if ignored := given.ignored():
+        yield (
+            f"{', '.join(ignored)} left out: vehicles are never teleported or given up, and the "
+            "seed is that of the episode; traffic may differ from SUMO's own"
+        )
+    if lacking := given.lacking():
+        yield (
+            f"{', '.join(lacking)} left out: an episode begins in an empty network, and edges have "
+            "no weights of their own; traffic differs from SUMO's own"
+        )
+    if times := given.physics().get("control"):
+        longer = ", ".join(f"{name} = {value:g}" for name, value in times.items())
+        yield f"its steps do not divide the usual times of signals; {longer} in their place"
+    if not given.has_end:
+        yield (
+            "it has no end, so an episode is one hour; write duration_s into scenario.toml for "
+            "another length"
+        )
 
 
 def _network_of(configuration: SumoConfiguration) -> Document:

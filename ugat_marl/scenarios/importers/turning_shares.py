@@ -75,7 +75,9 @@ def walked(
             found.
     """
     if not (math.isfinite(vph) and 0 < vph <= 1e5):
-        raise OptionError(f"--vph {vph:g} is not a number of vehicles an hour; give more than 0, up to 100000")
+        raise OptionError(
+            f"--vph {vph:g} is not a number of vehicles an hour; give one above 0, up to 100000"
+        )
     if min(shares) < 0 or not math.isfinite(sum(shares)) or sum(shares) <= 0:
         raise OptionError(
             f"--turns {shares}: three shares, none negative and not all 0, are needed"
