@@ -10,7 +10,14 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional, arg
 
-from ugat_marl.cli.arguments import RayAddress, require_names, require_numbers, workers_of
+from ugat_marl.cli.arguments import (
+    LengthS,
+    RayAddress,
+    Workers,
+    require_names,
+    require_numbers,
+    workers_of,
+)
 from ugat_marl.effects import NAMED_DOMAINS, expand_domains, load_scenario
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, OutputError, ScenarioError, UgatMarlError
@@ -49,8 +56,8 @@ class Evaluate:
             gap; see ugat-marl domains.
         seeds: Number of episodes of each policy in each domain.
         first_seed: Seed of the first episode.
-        duration_s: Length of an episode in s; default: the scenario's own.
-        workers: Simulations at a time; default: one per core.
+        duration_s: Length of an episode in s.
+        workers: Simulations at a time.
         ray: Play on Ray instead.
         out: JSON file for the table and every episode.
     """
@@ -60,8 +67,8 @@ class Evaluate:
     domains: tuple[str, ...] = ("sim", "V1", "V2", "V3", "V4")
     seeds: int = 5
     first_seed: int = 1000
-    duration_s: float | None = None
-    workers: int | None = None
+    duration_s: LengthS = None
+    workers: Workers = None
     ray: RayAddress = None
     out: Path | None = None
 

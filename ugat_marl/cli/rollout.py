@@ -12,6 +12,7 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from ugat_marl.cli.arguments import (
+    LengthS,
     RayAddress,
     Workers,
     refuse_options,
@@ -85,7 +86,7 @@ class Rollout:
         observation: Observation to record: movements, count, queue, pressure, waiting, density. The
             learner universal reads movements by default.
         neighbours: Agents also observe intersections up to this many roads away.
-        duration_s: Length of an episode in s; default: the scenario's own.
+        duration_s: Length of an episode in s.
         crossings: Also record when vehicles cross the stop lines, which groundings of greens read.
         workers: Simulations at a time.
         ray: Record on Ray instead.
@@ -106,7 +107,7 @@ class Rollout:
     epsilon: float = 0.3
     observation: str = "movements"
     neighbours: int = 0
-    duration_s: float | None = None
+    duration_s: LengthS = None
     crossings: bool = True
     workers: Workers = None
     ray: RayAddress = None
