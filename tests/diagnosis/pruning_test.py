@@ -97,6 +97,7 @@ def selector_with(ledger: Ledger) -> Any:
     selector._fitter, selector._thresholds, selector._reporter = ledger, THRESHOLDS, Silent()
     selector._seen, selector._of_round, selector._alpha = {}, {}, 0.05
     selector._effort, selector._of_library, selector._places = Effort(), (), ()
+    selector._library = ()
     return selector
 
 
@@ -528,3 +529,40 @@ def test_a_share_of_each_difference_counts_as_noise_of_the_model() -> None:
         selector._tested(model)
     share = THRESHOLDS.tolerance
     assert asked[0]["network"] == pytest.approx(np.array([[3.0, -20.0]]) ** 2 * share**2)
+
+
+@pytest.mark.parametrize(
+    ("chance", "error", "named"),
+    [(0.5, 0.1, (1.5,)), (0.01, 0.1, None), (0.5, 1.0, None)],
+    ids=["it explains", "something remains", "its interval holds the usual value"],
+)
+def test_an_effect_that_is_clear_along_its_direction_is_named(
+    chance: float, error: float, named: tuple[float, ...] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Linear prediction places it where it does nothing; the network shows it at 1.5."""
+    headway, other = HEADWAY[0], DEMAND[0]
+    both = ("desired_speed", "headway")
+    ledger = Ledger(
+        {("desired_speed",): 100.0, both: 90.0, ("desired_speed", "demand_level"): 200.0},
+        {("desired_speed",): 0.001, both: chance},
+    )
+    selector = selector_with(ledger)
+    selector.kept, selector.test = ledger.kept, ledger.test
+    selector.exact = lambda tested: replace(tested, errors=np.full(2, error))
+    strengths = [(headway, (1.2,)), (headway, (1.5,)), (other, (1.2,))]
+    selector._directions = lambda *_: [
+        SimpleNamespace(hypothesis=hypothesis, level=level) for hypothesis, level in strengths
+    ]
+    selector._whitener = lambda *_: None
+    gaps = {((headway, (1.2,)),): 80.0, ((headway, (1.5,)),): 30.0, ((other, (1.2,)),): 300.0}
+    selector._gap_of_network = lambda model: gaps[model.members[1:]]
+    proposals = [
+        SimpleNamespace(members=((SPEED[0], (1.1,)),)),  # it is there already
+        SimpleNamespace(members=((headway, (1.1,)), (other, (1.1,)))),
+        SimpleNamespace(members=((headway, (1.1,)),)),
+        SimpleNamespace(members=((other, (1.1,)),)),
+    ]
+    monkeypatch.setattr(select, "propose", lambda *_: proposals)
+    best = ledger.with_chance(ledger.simulate((SPEED,), 16))
+    found = selector._with_clear_effect(best)
+    assert found.model.members == ((SPEED,) if named is None else (SPEED, (headway, named)))

@@ -148,6 +148,8 @@ class Selector:
                 if ends is not None and best.residual.p <= self._alpha and ends(best):
                     return self._selected(best, located, complete=False)
             best = Pruner(self._fitter, self, self._alpha, self._reporter).pruned(best, base)
+            if best.model.members and best.residual.p <= self._alpha:
+                best = self._with_clear_effect(best)
         except OutOfTime:
             complete = False
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
@@ -336,6 +338,35 @@ class Selector:
         effect that is there would seem to make it worse.
         """
         return self._fitter.simulate(model.members).cost if model.members else model.cost
+
+    def _with_clear_effect(self, best: Tested) -> Tested:
+        """Add the effect that is clear along its own direction, if it explains what is left.
+
+        Linear prediction places effects that act in steps where they do nothing, and chance among
+        all statistics hides what those of the whole network show. So the strengths that were
+        simulated are compared by the latter.
+        """
+        directions = self._directions(best.model, self._library, self._thresholds.rounds)
+        present = {hypothesis.key for hypothesis, _ in best.model.members}
+        proposals = propose(directions, self._whitener(best.model, WIDE), self._thresholds)
+        clear = [hypothesis for ((hypothesis, _), *more) in (x.members for x in proposals)
+                 if not more and hypothesis.key not in present]  # fmt: skip
+        strengths = [((x.hypothesis, x.level),) for x in directions
+                     if x.hypothesis in clear[: self._thresholds.nearest]]  # fmt: skip
+        tried = self._simulated(best.model, strengths, "clear effects")
+        if not tried:
+            return best
+        nearest = min(tried, key=self._gap_of_network)
+        steps = self._thresholds.steps_of_the_best
+        model = self.kept(self._fitter.refine(nearest, steps, closely=True))
+        tested = self.exact(self.test(model))
+        certain = not doubtful(tested, self._thresholds.half_interval)
+        return tested if tested.residual.p > self._alpha and certain else best
+
+    def _gap_of_network(self, model: Fitted) -> float:
+        """Return the squared distance of the statistics of the whole network."""
+        measured = self._whitener(model, WIDE).measured
+        return float(measured @ measured)
 
     def _nearest(self) -> list[Members]:
         """Return the simulated single effects of the library that come nearest to the data.
