@@ -15,7 +15,7 @@ def says(verdict: str, *effects: Mapping[str, Any], **more: Any) -> Diagnosis | 
     nothing = dict.fromkeys(Diagnosis.__dataclass_fields__)
     many = (
         "left_out", "ruled_out", "findings", "where", "left", "alternatives", "statistics",
-        "lanes", "untried", "approaches", "patterns", "unnamed",
+        "lanes", "untried", "approaches", "patterns", "unnamed", "limits",
     )  # fmt: skip
     grounds = {"distance": 1.0, "runner_up_is_worse_by": None}
     return Diagnosis.from_json(
