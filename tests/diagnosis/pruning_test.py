@@ -566,3 +566,24 @@ def test_an_effect_that_is_clear_along_its_direction_is_named(
     best = ledger.with_chance(ledger.simulate((SPEED,), 16))
     found = selector._with_clear_effect(best)
     assert found.model.members == ((SPEED,) if named is None else (SPEED, (headway, named)))
+
+
+def test_a_budget_that_ends_behind_the_search_leaves_its_result(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def spent(*_: object) -> None:
+        raise OutOfTime("the budget is spent")
+
+    ledger = Ledger({("headway",): 900.0}, {("headway",): 0.001})
+    selector = selector_with(ledger)
+    selector.examined = set()
+    found = ledger.with_chance(ledger.simulate((HEADWAY,), 16))
+    selector._library_directions = selector._round = lambda *_: None
+    selector._fitted = lambda *_: found
+    selector._with_clear_effect = spent
+    monkeypatch.setattr(select, "Pruner", lambda *_: SimpleNamespace(pruned=lambda *_: found))
+    base = replace(found, model=replace(found.model, members=(), cost=2000.0))
+    located = records.Located(base, (), True, frozenset())
+    selected = selector.select(located, (HEADWAY,))
+    assert selected.best is found
+    assert selected.complete

@@ -149,7 +149,8 @@ class Selector:
                     return self._selected(best, located, complete=False)
             best = Pruner(self._fitter, self, self._alpha, self._reporter).pruned(best, base)
             if best.model.members and best.residual.p <= self._alpha:
-                best = self._with_clear_effect(best)
+                with contextlib.suppress(OutOfTime):  # the search itself has ended
+                    best = self._with_clear_effect(best)
         except OutOfTime:
             complete = False
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
