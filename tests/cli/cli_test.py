@@ -60,6 +60,14 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ),
         (["train", "single-v1", "--seed"], "--seed needs a value"),
         (["train", "single-v1", "--rollout-epsilon", "z"], "--rollout-epsilon 'z': not a number"),
+        (
+            ["scenario", "new", "x", "--begin-s", "7:05"],
+            "nor None; this time of day is 25500 s",
+        ),
+        (
+            ["train", "single-v1", "--rollout-epsilon", "7:00:10"],
+            "not a number; this time of day is 25210 s",
+        ),
         (["train", "single-v1", "extra"], "'extra'"),
         (["train", "single-v1", "--real-log", "nowhere.parquet"], "nowhere.parquet"),
         (["evaluate", "single-v1", "--policies", "largst-queue:20"], "'largest-queue'"),

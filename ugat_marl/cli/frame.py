@@ -59,6 +59,7 @@ _PLAIN_WORDS = {
     r"^Error parsing [\w.]+: *": "",
 }
 """Messages of tyro to what they mean."""
+_CLOCK = re.compile(r"\b(\d{1,2}):([0-5]\d)(?::([0-5]\d))?'?: not a number")
 _LONGEST_MESSAGE = 1500
 """Most characters of an error: about twenty lines of a terminal."""
 _WAYS_OUT = {
@@ -395,6 +396,9 @@ def _one_line(box: str, name: str) -> str:
     words = " ".join(" ".join(message).split()).rstrip(".")
     for pattern, plain in _PLAIN_WORDS.items():
         words = re.sub(pattern, plain, words)
+    if clock := _CLOCK.search(words):
+        hour, minute, second = (int(part or 0) for part in clock.groups())
+        words += f"; this time of day is {3600 * hour + 60 * minute + second} s"
     return words
 
 
