@@ -344,7 +344,7 @@ def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, DetectorL
 def test_turning_counts_are_those_asked_for(
     crossing: tuple[Scenario, Network, DetectorLayout],
 ) -> None:
-    """They were counted in a quarter of the period."""
+    """One was counted in the first half of the first bin, the other in the whole second bin."""
     _, _, layout = crossing
     sums = np.zeros((len(FEATURES), len(layout.places), 2))
     turning = np.array([[[4.0, 5.0]], [[2.0, 5.0]]])
@@ -357,9 +357,9 @@ def test_turning_counts_are_those_asked_for(
     edges = {edge: np.zeros(2) for _, edge, _ in layout.places}
     asked = edges | {"S_C C_N": np.array([12.0, 16.0]), "W_C C_E": np.array([1.0, 0.0])}
     given = edges | {"S_C C_N": np.array([10.0, 10.0]), "W_C C_E": np.array([9.0, 9.0])}
-    turns = (("S_C", "C_N"), ("W_C", "C_E"))
-    found = corrected(day, layout, DemandBalance(asked, given), turns)
-    assert found.supplementary[TURNING].tolist() == [[[4.0 + 8.0 / 4, 5.0]], [[0.0, 5.0]]]
+    spans = {("S_C", "C_N"): [(0.0, 300.0)], ("W_C", "C_E"): [(600.0, 900.0), (900.0, 1200.0)]}
+    found = corrected(day, layout, DemandBalance(asked, given), spans)
+    assert found.supplementary[TURNING].tolist() == [[[4.0 + 2.0 / 2, 5.0]], [[0.0, 5.0]]]
     assert day.supplementary[TURNING] is turning and turning[0, 0, 0] == 4.0
 
 

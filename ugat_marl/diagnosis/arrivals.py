@@ -30,7 +30,7 @@ from ugat_marl.diagnosis.features import (
     bins_in,
 )
 from ugat_marl.diagnosis.journeys import Crossings, matched
-from ugat_marl.diagnosis.supplementary_data import TURNING
+from ugat_marl.diagnosis.supplementary_data import TURNING, Span
 from ugat_marl.diagnosis.thresholds import DayThresholds
 from ugat_marl.effects import (
     depart_s,
@@ -382,19 +382,20 @@ def corrected(
     counted: Tally,
     layout: DetectorLayout,
     due: DemandBalance,
-    turns: Sequence[tuple[str, str]] = (),
+    spans: Mapping[tuple[str, str], Sequence[Span]] | None = None,
 ) -> Tally:
     """Return the tally of a day, with counts corrected to the model's demand.
 
     Corrected count = count + share * (asked - given), where the share of a lane is its part of the
     vehicles given to its edge. If none were given, the lanes of the edge share alike. The share of
-    a turn is the part of the period in which it was counted.
+    a turn is, for each bin of time, the part of it in which the turn was counted.
 
     Args:
         counted: Tally of a day with measured arrivals.
         layout: Lanes and detectors.
         due: Vehicles asked for and given.
-        turns: Edge and next edge of each member of the block of turning counts.
+        spans: Start and end of the counted intervals, s, by edge and next edge, for each member of
+            the block of turning counts.
 
     Returns:
         The tally without platoon features, since these repeat the measured arrivals.
@@ -414,15 +415,22 @@ def corrected(
                 bins[line, place, :width] += share * more[:width]
     sums[[INDEX[name] for name in PLATOON_FEATURES]] = 0.0
     supplementary = dict(counted.supplementary)
-    if TURNING in supplementary and counted.window is not None:
-        begin_s, end_s = counted.window
+    if TURNING in supplementary and counted.window is not None and spans is not None:
         supplementary[TURNING] = turning = supplementary[TURNING].copy()
-        for member, turn in enumerate(map(" ".join, turns)):
-            vehicles, counted_min = turning[member, 0]
-            share = 60.0 * counted_min / (end_s - begin_s)
-            more = float((due.asked[turn] - due.given[turn]).sum())
-            turning[member, 0, 0] = max(vehicles + share * more, 0.0)
+        for member, (turn, intervals) in enumerate(spans.items()):
+            more = due.asked[" ".join(turn)] - due.given[" ".join(turn)]
+            own = float(_shares_of_bins(intervals, counted.window, len(more)) @ more)
+            turning[member, 0, 0] = max(turning[member, 0, 0] + own, 0.0)
     return replace(counted, sums=sums, bins=np.maximum(bins, 0.0), supplementary=supplementary)
+
+
+def _shares_of_bins(intervals: Sequence[Span], window: Span, bins: int) -> Array:
+    """Return the part of each bin of a period that intervals cover, ``(bins,)``."""
+    times = np.linspace(*window, bins + 1)
+    covered = np.zeros(bins)
+    for begin_s, end_s in intervals:
+        covered += np.diff(np.clip(times, begin_s, end_s))
+    return covered / np.diff(times)
 
 
 def _approaches(layout: DetectorLayout, thresholds: DayThresholds) -> dict[str, tuple[_Lane, ...]]:

@@ -579,7 +579,11 @@ class Engine:
     ) -> Replicate:
         if due is None:
             return Replicate(counted, travel_time_s)
-        tally = corrected(counted, self.layout, due, self._turns)
+        measured = self._supplementary
+        spans = None
+        if measured is not None and counted.period is not None:
+            spans = dict(zip(measured.turns, measured.spans[counted.period], strict=True))
+        tally = corrected(counted, self.layout, due, spans)
         return Replicate(tally, travel_time_s, counted, due)
 
     def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
