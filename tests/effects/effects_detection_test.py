@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -143,6 +144,17 @@ def test_splash_reports_a_share_of_the_next_lane() -> None:
     assert times(after, "far left") == times(day, "far left")
     on = after.passages["far"].on_s
     assert (np.diff(on) >= 0).all()
+
+
+def test_a_second_splash_chooses_independently_of_the_first() -> None:
+    many = passages([10.0 * n for n in range(1000)], [10.0 * n + 1 for n in range(1000)])
+    day = period(far_left=many)
+    for _ in range(2):
+        day = DetectorSplash("far", 0.3).observe(day, DETECTORS, {})
+    reports = Counter(times(day, "far"))
+    twice = sum(count == 2 for count in reports.values())
+    assert twice == pytest.approx(1000 * 0.3**2, abs=4 * (1000 * 0.09 * 0.91) ** 0.5)
+    assert len(reports) == pytest.approx(1000 * (1 - 0.7**2), abs=4 * (1000 * 0.51 * 0.49) ** 0.5)
 
 
 def test_splash_of_every_vehicle_can_be_taken_off() -> None:

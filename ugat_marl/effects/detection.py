@@ -271,14 +271,17 @@ class DetectorSplash(_OfDetectors):
         return f"also report {100 * self.share:.3g} % of the vehicles on the next lanes"
 
     def observe(self, period: Period, detectors: Sequence[Detector], owner: Owner) -> Period:
-        """Add passages of the next lanes, chosen by a hash of the detector, number and time."""
+        """Add passages of the next lanes, chosen by a hash of the detector, number and time.
+
+        A second splash chooses independently of the first.
+        """
         beside = next_detectors(detectors)
 
         def splashed(name: str, passages: Passages) -> Passages:
             parts = [passages]
             for other in beside.get(name, ()):
                 seen = period.of_detector(other)
-                parts.append(seen.at(self._chosen(name, other, seen)))
+                parts.append(seen.at(self._chosen(name, other, seen, passages)))
             return Passages.concatenated(parts)
 
         return self._edited(period, detectors, splashed)
@@ -316,10 +319,15 @@ class DetectorSplash(_OfDetectors):
 
         return self._edited(period, detectors, thinned)
 
-    def _chosen(self, name: str, other: str, seen: Passages) -> NDArray[np.bool_]:
+    def _chosen(
+        self, name: str, other: str, seen: Passages, reported: Passages
+    ) -> NDArray[np.bool_]:
+        times = [set(zip(x.on_s.tolist(), x.off_s.tolist(), strict=True)) for x in (seen, reported)]
+        earlier = len(times[0] & times[1])  # passages that an earlier splash has added
+        names = (name, other, *([str(earlier)] if earlier else ()))
         return np.array(
             [
-                hashed_uniform("splash", name, other, str(n), f"{time:.3f}") < self.share
+                hashed_uniform("splash", *names, str(n), f"{time:.3f}") < self.share
                 for n, time in enumerate(seen.seen_s.tolist())
             ],
             dtype=np.bool_,
