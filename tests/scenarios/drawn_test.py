@@ -212,7 +212,7 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         {"profiles": ("foo",)}, {"turns": (0.5, 0.5)}, {"turns": (float("nan"), 0.5, 0.5)},
         {"turns": (0.5, float("nan"), 0.5)}, {"load": (0.5, 0.6, 0.7)}, {"lanes": (1,)},
         {"load": (0.5, float("nan"))}, {"lanes": 2}, {"load": [0.5, 0.6]}, {"shift": (0.1, 0.2)},
-        {"duration_s": (600.0, 900.0)},
+        {"duration_s": (600.0, 900.0)}, {"shift": (0.1,)}, {"turns": 0.5},
     ],
 )  # fmt: skip
 def test_impossible_ranges(values: dict[str, object]) -> None:

@@ -134,7 +134,7 @@ class NetworkRanges:
         for name, (least, most) in _LIMITS.items():
             value: Any = getattr(self, name)
             paired = isinstance(getattr(NetworkRanges, name), tuple)
-            if (isinstance(value, tuple) and len(value) == 2) != paired:
+            if isinstance(value, tuple) != paired or (paired and len(value) != 2):
                 wanted = "the least and the largest value" if paired else "one number"
                 raise OptionError(f"{name} = {value}: give {wanted}")
             bounds = cast(Range, value if paired else (value, value))
@@ -142,7 +142,7 @@ class NetworkRanges:
                 raise OptionError(
                     f"{name} = {value}: give values from {least:g} to {most:g}, the least first"
                 )
-        if len(self.turns) != 3 or not all(0 < share < math.inf for share in self.turns):
+        if np.shape(self.turns) != (3,) or not all(0 < share < math.inf for share in self.turns):
             raise OptionError(f"turns = {self.turns}: give three shares above 0")
         if not self.profiles or not {*self.profiles} <= {*get_args(Profile)}:
             raise OptionError(
