@@ -408,7 +408,8 @@ def test_a_scenario_with_plans_keeps_its_papers(tmp_path: Path) -> None:
     table, out = str(tmp_path / "p.csv"), str(tmp_path / "h")
     assert main(["plan", str(tmp_path / "g"), "--out", table]) == 0
     put = ["plan", str(tmp_path / "g"), "--apply", table, "--out"]
-    assert main([*put, out]) == 0 == main([*put, str(tmp_path / "g"), "--force"])
+    assert main([*put, out]) == 0 == main([*put, out, "--force"])
+    assert main([*put, str(tmp_path / "g"), "--force"]) == 0
     for folder in ("g", "h"):
         text = (tmp_path / folder / "README.md").read_text()
         assert text.startswith(f"# {folder}\n\nIts lights have the programmes of `p.csv`")

@@ -159,7 +159,8 @@ class Plan:
     def _command(self) -> str:
         """Return the command line that makes the same scenario again."""
         words = ["ugat-marl", "plan", self.scenario, "--out", str(self.out)]
-        return shlex.join([*words, *given_words(self)])
+        in_place = self.out.resolve() == Path(self.scenario).resolve()
+        return shlex.join([*words, *given_words(self, without=() if in_place else ("force",))])
 
     def _lights(self) -> dict[str, str]:
         pairs: dict[str, str] = {}
