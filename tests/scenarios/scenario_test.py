@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
-from dataclasses import FrozenInstanceError
+from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 
 import pydantic
@@ -206,6 +206,14 @@ def test_written_and_read_again_it_is_the_same(crossing: Crossing, tmp_path: Pat
     assert "🚦" in copy.settings.description
     # It takes the place of another one.
     assert read_scenario(copy.write(directory)).hash == scenario.hash
+
+
+def test_files_that_only_a_replaced_scenario_names_stay(crossing: Crossing, tmp_path: Path) -> None:
+    scenario = read_scenario(crossing())
+    plans = Document("plans.add.xml", None, b"<additional/>")
+    place = replace(scenario, additional=(plans,)).write(tmp_path / "place")
+    assert read_scenario(scenario.write(place)).hash == scenario.hash
+    assert (place / "plans.add.xml").read_bytes() == b"<additional/>"
 
 
 def test_a_scenario_is_not_written_over_the_files_it_is_read_from(
