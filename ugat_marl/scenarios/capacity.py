@@ -117,12 +117,9 @@ def degrees_of_saturation(scenario: Scenario, flows_vph: Flows | None = None) ->
 
 def counted_flows_vph(scenario: Scenario) -> Flows:
     """Return the vehicles per hour from edge to edge, counted in the routes of the scenario."""
-    begin_s = scenario.settings.begin_s
-    end_s = begin_s + scenario.settings.duration_s
     counts: Counter[tuple[str, str]] = Counter()
-    for _, depart_s, edges in departures(scenario, routed=False):
-        if begin_s <= depart_s < end_s:
-            counts.update(zip(edges, edges[1:], strict=False))
+    for _, _, edges in departures(scenario, routed=False):
+        counts.update(zip(edges, edges[1:], strict=False))
     hours = scenario.settings.duration_s / 3600
     return {movement: count / hours for movement, count in counts.items()}
 

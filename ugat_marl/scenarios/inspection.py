@@ -686,9 +686,8 @@ class _Traffic:
             length_s, defaultdict(Counter), defaultdict(Counter), Counter(), {}, length_s, 0.0, 0.0
         )
         for _, depart, edges in departures(scenario, routed=demand.routed, reporter=reporter):
-            if begin <= depart < begin + length_s:
-                traffic._drive(depart - begin, edges, seconds)
-                lengths_s.append(sum(seconds.get(edge, 0.0) for edge in edges))
+            traffic._drive(depart - begin, edges, seconds)
+            lengths_s.append(sum(seconds.get(edge, 0.0) for edge in edges))
         lengths_s.sort()
         traffic.fill_s = lengths_s[math.ceil(0.95 * len(lengths_s)) - 1] if lengths_s else 0.0
         return traffic

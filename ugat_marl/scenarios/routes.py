@@ -225,15 +225,15 @@ def driven_routes(scenario: Scenario) -> Iterator[tuple[str, ...]]:
     Args:
         scenario: Any scenario; `demand_as_vehicles` turns its trips and flows into vehicles.
     """
-    for _, depart, edges in departures(scenario, routed=False):
-        if edges and depart >= scenario.settings.begin_s:
+    for _, _, edges in departures(scenario, routed=False):
+        if edges:
             yield tuple(edges)
 
 
 def departures(
     scenario: Scenario, *, routed: bool, reporter: Reporter | None = None
 ) -> Iterator[tuple[str, float, list[str]]]:
-    """Yield name, departure in s, and roads of every vehicle that departs before the end.
+    """Yield name, departure in s, and roads of every vehicle that departs within the episode.
 
     Vehicles that block a lane for an effect are left out.
 
@@ -246,16 +246,16 @@ def departures(
     begin = scenario.settings.begin_s
     end = begin + scenario.settings.duration_s
     for document in scenario.routes if routed else demand_as_vehicles(scenario).routes:
-        name, depart, blocks = "", 0.0, False
+        name, depart, left_out = "", 0.0, False
         for tag in document.scan(reporter):
             if tag.name == "vehicle":
                 name, text = tag.attributes.get("id", ""), tag.attributes.get("depart", "0")
                 depart = departure_s(text)
                 depart = begin if math.isnan(depart) else depart
-                blocks = is_blocker(name, tag.attributes.get("type", ""))
+                left_out = depart < begin or is_blocker(name, tag.attributes.get("type", ""))
                 if depart >= end:  # vehicles are sorted by departure
                     break
-            elif tag.name == "route" and tag.parent == "vehicle" and not blocks:
+            elif tag.name == "route" and tag.parent == "vehicle" and not left_out:
                 edges = tag.attributes.get("edges", "").split()
                 yield name, depart, laps_of(tag.attributes) * edges
 
