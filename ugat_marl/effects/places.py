@@ -11,7 +11,14 @@ from dataclasses import dataclass
 
 from ugat_marl.errors import UnknownNameError
 from ugat_marl.files import parse_xml
-from ugat_marl.scenarios import Scenario, cars_may_use, rail_signals_of, turns_around
+from ugat_marl.scenarios import (
+    Scenario,
+    cars_may_use,
+    end_lane,
+    rail_signals_of,
+    start_lane,
+    turns_around,
+)
 
 
 @dataclass(frozen=True)
@@ -133,8 +140,7 @@ def _places(content: bytes, source: str) -> Places:
         start, end = connection.get("from", ":"), connection.get("to", ":")
         if start not in edges or end not in edges:
             continue
-        entry = f"{start}_{connection.get('fromLane')}"
-        leaving = f"{end}_{connection.get('toLane')}"
+        entry, leaving = start_lane(connection), end_lane(connection)
         if (entry not in lanes or lanes[entry].cars) and (
             leaving not in lanes or lanes[leaving].cars
         ):

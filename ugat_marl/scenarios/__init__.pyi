@@ -52,6 +52,7 @@ from .inspection import green_of_file as green_of_file
 from .inspection import survey as survey
 from .junctions import Link as Link
 from .junctions import cars_may_use as cars_may_use
+from .junctions import end_lane as end_lane
 from .junctions import rail_signals_of as rail_signals_of
 from .junctions import start_lane as start_lane
 from .junctions import turns_around as turns_around
