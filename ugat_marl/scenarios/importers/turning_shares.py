@@ -1,7 +1,8 @@
 """Demand from turning shares: random arrivals and random turns.
 
 Arrivals at each entry are a Poisson process. At each junction a vehicle draws its turn from the
-shares, until it leaves the network. A route that would pass a junction twice is drawn again.
+shares, until it leaves the network. A route that would pass a junction twice is drawn again,
+but at an entry from which no other one was found.
 """
 
 from __future__ import annotations
