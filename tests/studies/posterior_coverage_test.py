@@ -41,6 +41,21 @@ def test_two_thirds_of_the_streets_are_not_of_the_prior() -> None:
     assert np.array_equal(again.effects, draw_other(WORLDS, "alone", 3).effects)
 
 
+def test_networks_have_streets_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds: list[int] = []
+    monkeypatch.setattr(Network, "of", lambda *_: None)
+    monkeypatch.setattr(
+        posterior_coverage, "study", lambda *given: seeds.append(given[3]) or list[Asked]()
+    )
+    words = ["a", "b", "c", "--seed", "5", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["posterior_coverage", *words])
+    posterior_coverage.main()
+    assert seeds[0] == 5
+    assert len(set(seeds)) == 3
+
+
 def test_effects_alone_are_there_in_half_of_the_streets_and_together_change_by_one_number() -> None:
     library = WORLDS.library
     low, nominal, high = WORLDS.ends
