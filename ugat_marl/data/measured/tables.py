@@ -36,6 +36,8 @@ Kind = Literal["text", "number"]
 
 CLOCK_JUMP_S = 60.0
 """A larger step back in time means a clock set back; a smaller one means a late delivery."""
+MOST_PACKETS = 100
+"""With more steps back, rows are out of order, and no clock was set back."""
 FEW_ROWS = 10
 """With fewer rows, a clock set back looks the same as rows out of order."""
 MOST_OUTSIDE = 0.5
@@ -745,6 +747,11 @@ def clock_steps(clock: NDArray[np.float64], begin_s: float = -np.inf) -> NDArray
         begin_s: Start of the period, s: a row before it is no late one.
     """
     steps = np.flatnonzero(np.diff(clock) < -CLOCK_JUMP_S) + 1  # others are late rows
+    following = np.append(clock, np.inf)[steps + 1]
+    alone = following >= clock[steps - 1]  # behind a late row the clock is right again
+    steps = steps[~alone | (clock[steps] < begin_s)]
+    if len(steps) > MOST_PACKETS:
+        return steps  # rows out of order
     late = np.array([_are_late(clock, int(step)) for step in steps], bool)
     return steps[~late | (clock[steps] < begin_s)]
 
