@@ -77,7 +77,7 @@ def diagnosed(directory: Path, corrected: str | None = "V4", **changes: Any) -> 
     """Write a diagnosis as `diagnose` does, with nothing in it but verdict and correction."""
     nothing: tuple[str, ...] = (
         "left_out", "ruled_out", "findings", "effects", "where", "left", "alternatives",
-        "statistics", "lanes", "untried", "approaches", "patterns", "unnamed",
+        "statistics", "lanes", "untried", "approaches", "patterns", "unnamed", "limits",
     )  # fmt: skip
     none = (
         "best", "heldout", "evidence", "criteria", "travel_time", "next_measurement",
