@@ -15,7 +15,7 @@ from ugat_marl.diagnosis import Hypothesis, global_hypotheses, records, select
 from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import FEATURES
 from ugat_marl.diagnosis.fit import Fitter
-from ugat_marl.diagnosis.hypotheses import Members, library
+from ugat_marl.diagnosis.hypotheses import CAUTION, Members, library
 from ugat_marl.diagnosis.prune import Pruner, doubtful
 from ugat_marl.diagnosis.records import Fitted
 from ugat_marl.diagnosis.select import Selector
@@ -564,7 +564,7 @@ def test_an_effect_that_is_clear_along_its_direction_is_named(
     ]
     monkeypatch.setattr(select, "propose", lambda *_: proposals)
     best = ledger.with_chance(ledger.simulate((SPEED,), 16))
-    found = selector._with_clear_effect(best)
+    found = selector._explained_at_last(best)
     assert found.model.members == ((SPEED,) if named is None else (SPEED, (headway, named)))
 
 
@@ -580,10 +580,34 @@ def test_a_budget_that_ends_behind_the_search_leaves_its_result(
     found = ledger.with_chance(ledger.simulate((HEADWAY,), 16))
     selector._library_directions = selector._round = lambda *_: None
     selector._fitted = lambda *_: found
-    selector._with_clear_effect = spent
+    selector._explained_at_last = spent
     monkeypatch.setattr(select, "Pruner", lambda *_: SimpleNamespace(pruned=lambda *_: found))
     base = replace(found, model=replace(found.model, members=(), cost=2000.0))
     located = records.Located(base, (), True, frozenset())
     selected = selector.select(located, (HEADWAY,))
     assert selected.best is found
     assert selected.complete
+
+
+@pytest.mark.parametrize(("chance", "named"), [(0.5, True), (0.01, False)])
+def test_beside_one_property_of_drivers_the_others_are_tried_together(
+    chance: float, named: bool
+) -> None:
+    """A clock or a closure may imitate them, and no single step leads there."""
+    known = {item.name: item for item in global_hypotheses(load_scenario("single-v1"), CAUTION)}
+    faster = (known["acceleration"], (0.7,))
+    drivers = tuple(CAUTION)
+    ledger = Ledger(
+        {drivers: 10.0, ("acceleration", "headway"): 100.0}, {drivers: chance},
+    )  # fmt: skip
+    selector = selector_with(ledger)
+    selector.kept, selector.test, selector.exact = ledger.kept, ledger.test, ledger.exact
+    selector._library = tuple(known.values())
+    selector._with_clear_effect = lambda _: None
+    chances = {("acceleration", "headway"): 0.001}
+    ledger.chances |= chances
+    best = ledger.with_chance(ledger.simulate((faster, HEADWAY), 16))
+    found = selector._explained_at_last(best).model.members
+    assert names(found) == (drivers if named else ("acceleration", "headway"))
+    if named:
+        assert [values for _, values in found] == [(0.7,), (3.2,), (0.3,)]

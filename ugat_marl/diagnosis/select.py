@@ -12,6 +12,7 @@ from ugat_marl.diagnosis.engine import OutOfTime
 from ugat_marl.diagnosis.features import FEATURES, Tally
 from ugat_marl.diagnosis.fit import WIDE, Fitter, cost_of, uncertainty
 from ugat_marl.diagnosis.hypotheses import (
+    CAUTION,
     Hypothesis,
     Members,
     a_few,
@@ -150,7 +151,7 @@ class Selector:
             best = Pruner(self._fitter, self, self._alpha, self._reporter).pruned(best, base)
             if best.model.members and best.residual.p <= self._alpha:
                 with contextlib.suppress(OutOfTime):  # the search itself has ended
-                    best = self._with_clear_effect(best)
+                    best = self._explained_at_last(best)
         except OutOfTime:
             complete = False
             cheapest = min(self._seen.values(), key=cost_of, default=best.model)
@@ -340,8 +341,24 @@ class Selector:
         """
         return self._fitter.simulate(model.members).cost if model.members else model.cost
 
-    def _with_clear_effect(self, best: Tested) -> Tested:
-        """Add the effect that is clear along its own direction, if it explains what is left.
+    def _explained_at_last(self, best: Tested) -> Tested:
+        """Return a model that explains the data and whose effects are certain, else the given one.
+
+        It is fitted from two starting points that a search by single steps may miss.
+        """
+        for start in (self._with_clear_effect, self._as_cautious_drivers):
+            if (model := start(best)) is None:
+                continue
+            steps = self._thresholds.steps_of_the_best
+            tested = self.test(self.kept(self._fitter.refine(model, steps, closely=True)))
+            if tested.residual.p > self._alpha:
+                tested = self.exact(tested)
+                if not doubtful(tested, self._thresholds.half_interval):
+                    return tested
+        return best
+
+    def _with_clear_effect(self, best: Tested) -> Fitted | None:
+        """Return a model with the effect that is clear along its own direction as it was simulated.
 
         Linear prediction places effects that act in steps where they do nothing, and chance among
         all statistics hides what those of the whole network show. So the strengths that were
@@ -355,14 +372,18 @@ class Selector:
         strengths = [((x.hypothesis, x.level),) for x in directions
                      if x.hypothesis in clear[: self._thresholds.nearest]]  # fmt: skip
         tried = self._simulated(best.model, strengths, "clear effects")
-        if not tried:
-            return best
-        nearest = min(tried, key=self._gap_of_network)
-        steps = self._thresholds.steps_of_the_best
-        model = self.kept(self._fitter.refine(nearest, steps, closely=True))
-        tested = self.exact(self.test(model))
-        certain = not doubtful(tested, self._thresholds.half_interval)
-        return tested if tested.residual.p > self._alpha and certain else best
+        return min(tried, key=self._gap_of_network, default=None)
+
+    def _as_cautious_drivers(self, best: Tested) -> Fitted | None:
+        """Return a model in which drivers are cautious in every way, if they are in some way.
+
+        Beside one property alone, a clock or a closure imitates the others.
+        """
+        found = tuple(member for member in best.model.members if member[0].name in CAUTION)
+        mild, *_ = cautious_drivers(self._library) or [()]
+        if not found or len(found) == len(mild) or not mild:
+            return None
+        return self._fitter.simulate(merged(mild, found))
 
     def _gap_of_network(self, model: Fitted) -> float:
         """Return the squared distance of the statistics of the whole network."""
