@@ -589,9 +589,13 @@ def test_a_budget_that_ends_behind_the_search_leaves_its_result(
     assert selected.complete
 
 
-@pytest.mark.parametrize(("chance", "named"), [(0.5, True), (0.01, False)])
+@pytest.mark.parametrize(
+    ("chance", "delay_s", "named"),
+    [(0.5, 0.3, True), (0.01, 0.3, False), (0.5, 0.01, False)],
+    ids=["they explain", "something remains", "one is too small to matter"],
+)
 def test_beside_one_property_of_drivers_the_others_are_tried_together(
-    chance: float, named: bool
+    chance: float, delay_s: float, named: bool
 ) -> None:
     """A clock or a closure may imitate them, and no single step leads there."""
     known = {item.name: item for item in global_hypotheses(load_scenario("single-v1"), CAUTION)}
@@ -604,6 +608,8 @@ def test_beside_one_property_of_drivers_the_others_are_tried_together(
     selector.kept, selector.test, selector.exact = ledger.kept, ledger.test, ledger.exact
     selector._library = tuple(known.values())
     selector._with_clear_effect = lambda _: None
+    delay = known["startup_delay"], (delay_s,)
+    ledger.refined[drivers] = (faster, (known["deceleration"], (3.2,)), delay)
     chances = {("acceleration", "headway"): 0.001}
     ledger.chances |= chances
     best = ledger.with_chance(ledger.simulate((faster, HEADWAY), 16))

@@ -342,7 +342,9 @@ class Selector:
         return self._fitter.simulate(model.members).cost if model.members else model.cost
 
     def _explained_at_last(self, best: Tested) -> Tested:
-        """Return a model that explains the data and whose effects are certain, else the given one.
+        """Return a model that explains the data by effects that matter and are certain.
+
+        Without one it is the given one.
 
         It is fitted from two starting points that a search by single steps may miss.
         """
@@ -353,7 +355,9 @@ class Selector:
             tested = self.test(self.kept(self._fitter.refine(model, steps, closely=True)))
             if tested.residual.p > self._alpha:
                 tested = self.exact(tested)
-                if not doubtful(tested, self._thresholds.half_interval):
+                members = tested.model.members
+                matter = all(hypothesis.matters(values) for hypothesis, values in members)
+                if matter and not doubtful(tested, self._thresholds.half_interval):
                     return tested
         return best
 
