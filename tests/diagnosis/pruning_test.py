@@ -617,3 +617,16 @@ def test_beside_one_property_of_drivers_the_others_are_tried_together(
     assert names(found) == (drivers if named else ("acceleration", "headway"))
     if named:
         assert [values for _, values in found] == [(0.7,), (3.2,), (0.3,)]
+
+
+def test_the_same_effects_with_a_further_one_are_no_other_explanation() -> None:
+    costs = {("headway",): 100.0, ("headway", "demand_level"): 103.0, ("desired_speed",): 400.0}
+    ledger = Ledger(costs, {("headway",): 0.5})
+    selector = selector_with(ledger)
+    selector.examined, selector._costs = set(), {}
+    sets: list[Members] = [(HEADWAY,), (HEADWAY, DEMAND), (SPEED,)]
+    selector._seen = {str(k): ledger.simulate(members, 16) for k, members in enumerate(sets)}
+    best = ledger.with_chance(ledger.simulate((HEADWAY,), 16))
+    base = replace(best, model=replace(best.model, members=()))
+    located = records.Located(base, (), True, frozenset())
+    assert selector._selected(best, located, complete=True).runner_up_is_worse_by == 300.0

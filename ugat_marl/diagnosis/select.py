@@ -164,7 +164,10 @@ class Selector:
     def _selected(self, best: Tested, located: Located, *, complete: bool) -> Selected:
         rivals = tuple(sorted(self._seen.values(), key=cost_of))
         own = {hypothesis.key for hypothesis, _ in best.model.members}
-        others = [x for x in rivals if {hypothesis.key for hypothesis, _ in x.members} != own]
+        keys = [{hypothesis.key for hypothesis, _ in x.members} for x in rivals]
+        # The same effects with a further one are no other explanation.
+        others = [x for x, its in zip(rivals, keys, strict=True)
+                  if its != own and not (own and its > own)]  # fmt: skip
         worse_by = None
         if others:
             with contextlib.suppress(OutOfTime):  # the best model was not simulated on those days

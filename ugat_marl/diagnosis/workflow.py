@@ -210,9 +210,15 @@ def _diagnosed(
 
 
 def _with_limits(search: _Search, diagnosis: Diagnosis, reporter: Reporter) -> Diagnosis:
-    """Add the detection limits of the effects that a verdict does not name."""
-    selected = search.selected if diagnosis.verdict == "explained" else None
-    tested = search.located.base if selected is None else selected.best
+    """Add the detection limits of the effects that a verdict does not name.
+
+    Where the signal log or the detectors alone explain the data, those that the search has found
+    are not named, and limits are those of the scenario as it is.
+    """
+    named, tested = {effect.name for effect in diagnosis.effects}, search.located.base
+    if search.selected is not None:
+        best = search.selected.best
+        tested = best if {h.name for h, _ in best.model.members} <= named else tested
     limits = detection_limits(search.study, search.selector, tested, reporter)
     return replace(diagnosis, limits=limits)
 

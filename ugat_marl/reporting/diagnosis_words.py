@@ -263,9 +263,10 @@ def traffic_check_line(diagnosis: Diagnosis) -> str | None:
         apart = "of the fitted periods, as none is held out"
     # The same decimals as in `not_corrected`, which may stand beside this.
     before, after = (fixed(100 * error, 1) for error in (check.error_before, check.error_after))
+    what = "the unnamed correction" if diagnosis.unnamed else "the effects named"
     return (
         f"Simulated {check.measure} against data {apart}: sum of relative errors"
-        f"{check.days_in_words} {before} % before the effects named and {after} % after, {nearer}."
+        f"{check.days_in_words} {before} % before {what} and {after} % after, {nearer}."
     )
 
 
