@@ -150,8 +150,13 @@ def test_a_column_of_zeros_was_not_measured(
     whole.with_columns(pl.lit(0.0).alias(column)).write_csv(path)
     with pytest.raises(MeasuredDataError, match=f"{column} '0.0' is 0 wherever vehicles were"):
         read_measured(written, scenario, network)
-    few = pl.when(pl.int_range(pl.len()) % 2 == 0).then(0.0).otherwise(column)
+    number = pl.int_range(pl.len())
+    few = pl.when(number % 2 == 0).then(0.0).otherwise(column)
     whole.with_columns(few.alias(column)).write_csv(path)
+    read_measured(written, scenario, network)
+    one = pl.when(number == pl.col("count").arg_max()).then(0.0)  # all others are empty
+    rare = pl.when(number == pl.col("count").arg_max()).then(1).otherwise("count")
+    whole.with_columns(one.alias(column), rare.alias("count")).write_csv(path)
     read_measured(written, scenario, network)
 
 

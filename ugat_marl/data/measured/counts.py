@@ -205,12 +205,11 @@ def _refuse_units(path: Path, frame: pl.DataFrame) -> None:
         ),
     ):
         refuse(path, frame.filter(bad), column, complaint, way_out)
-    seen = frame.filter(pl.col("count") > 0)
     for column in ("occupancy", "mean_speed_mps"):
-        if seen["count"].sum() >= FEWEST and (seen[column].max() or 0.0) == 0.0:
-            zeros = seen.filter(pl.col(column) == 0)
+        seen = frame.filter(pl.col("count") > 0, pl.col(column).is_not_null())
+        if seen["count"].sum() >= FEWEST and not (seen[column] != 0).any():
             way_out = "leave the cells empty if it was not measured"
-            refuse(path, zeros, column, "is 0 wherever vehicles were counted", way_out)
+            refuse(path, seen, column, "is 0 wherever vehicles were counted", way_out)
 
 
 def turning_of(
