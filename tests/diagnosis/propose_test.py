@@ -151,7 +151,7 @@ def test_of_nothing_but_noise_nothing_is_worth_its_price(reference: Reference) -
     for seed in range(100, 140):
         target = whitener(reference, {}, among, noise=seed)
         found = propose(among, target, THRESHOLDS)
-        tempted += bool(found) and found[0].expected < float(target.measured @ target.measured)
+        tempted += bool(found) and found[0].expected < target.gap
     assert tempted <= 2
 
 
@@ -278,7 +278,7 @@ def test_an_imitation_is_exchanged_for_the_right_effect(reference: Reference) ->
     members, above, target = left_by(reference, among, "startup_delay", "headway", 0.9)
     best = exchanges(members, above, target, THRESHOLDS)[0]
     assert values(best) == pytest.approx({"headway": 1.0, "startup_delay": 0.6}, abs=0.02)
-    assert best.expected < 1.0 < float(target.measured @ target.measured)
+    assert best.expected < 1.0 < target.gap
     assert merged(members, best.members) == ((right.hypothesis, (0.6,)),)
 
 
@@ -311,7 +311,7 @@ def test_of_a_strong_effect_a_near_imitation_may_come_though_worse_is_predicted(
     mixed = right.difference["network"] + 0.15 * other.difference["network"]
     among[0] = replace(among[0], difference={"network": mixed, "time": NO_TIME})
     members, above, target = left_by(reference, among, "headway", "headway", 1.0)
-    assert float(target.measured @ target.measured) == pytest.approx(0.0, abs=1e-6)
+    assert target.gap == pytest.approx(0.0, abs=1e-6)
     near = exchanges(members, above, target, THRESHOLDS)
     assert [set(values(one)) for one in near] == [{"headway", "startup_delay"}]
     assert near[0].expected > THRESHOLDS.near_cost

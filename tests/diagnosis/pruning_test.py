@@ -101,6 +101,11 @@ def selector_with(ledger: Ledger) -> Any:
     return selector
 
 
+def spent(*_: object) -> None:
+    """Stand for a step at which the budget ends."""
+    raise OutOfTime("the budget is spent")
+
+
 def names(members: Members) -> tuple[str, ...]:
     return tuple(hypothesis.name for hypothesis, _ in members)
 
@@ -298,9 +303,6 @@ def test_when_the_budget_ends_no_doubtful_effect_is_named_either() -> None:
 def test_when_the_budget_ends_at_once_what_another_search_found_is_not_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def spent(*_: object) -> None:
-        raise OutOfTime("the budget is spent")
-
     ledger = Ledger({("headway",): 900.0}, {("headway",): 0.0})
     selector = selector_with(ledger)
     selector.examined = set()
@@ -466,9 +468,9 @@ def tried_in_round(
     ledger: Any = Ledger({}, {})
     ledger.data = [SimpleNamespace(sums=FEATURES)]
     selector = selector_with(ledger)
-    measured = np.full(100, np.sqrt(gap))
     selector._library, selector._library_directions = (), lambda model, number: ()
-    selector._whitener = lambda model, blocks: SimpleNamespace(measured=measured)
+    measured = np.zeros(100)
+    selector._whitener = lambda model, blocks: SimpleNamespace(measured=measured, gap=100.0 * gap)
     selector._nearest, selector._nearer = lambda: ["nearest"], lambda model, number: ["nearer"]
     selector._at_places = lambda model, directions, number: ["places"]
     tried: list[list[str]] = []
@@ -571,9 +573,6 @@ def test_an_effect_that_is_clear_along_its_direction_is_named(
 def test_a_budget_that_ends_behind_the_search_leaves_its_result(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def spent(*_: object) -> None:
-        raise OutOfTime("the budget is spent")
-
     ledger = Ledger({("headway",): 900.0}, {("headway",): 0.001})
     selector = selector_with(ledger)
     selector.examined = set()

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.hypotheses import Hypothesis, effects_of, merged
+from ugat_marl.diagnosis.hypotheses import Hypothesis, effects_of, keys_of, merged
 from ugat_marl.diagnosis.records import DetectionLimit, Tested
 from ugat_marl.diagnosis.residual import drawn_days
 from ugat_marl.diagnosis.select import Selector
@@ -76,7 +76,7 @@ def detection_limits(
 
 def _sides(hypotheses: Sequence[Hypothesis], tested: Tested) -> list[_Side]:
     """Return the effects that the model lacks, with their farthest plausible value on each side."""
-    present = {hypothesis.key for hypothesis, _ in tested.model.members}
+    present = keys_of(tested.model.members)
     sides: list[_Side] = []
     for hypothesis in hypotheses:
         if hypothesis.key in present or hypothesis.nothing is None:

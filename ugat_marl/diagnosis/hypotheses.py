@@ -307,6 +307,11 @@ def effects_of(members: Members) -> tuple[Effect, ...]:
     return ordered([hypothesis.effect(values) for hypothesis, values in members])
 
 
+def keys_of(members: Members) -> set[tuple[Any, ...]]:
+    """Return names and places of the effects of a model."""
+    return {hypothesis.key for hypothesis, _ in members}
+
+
 def each_left_out(members: Members) -> list[Members]:
     """Return the sets that lack one effect each."""
     return [(*members[:index], *members[index + 1 :]) for index in range(len(members))]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ugat_marl.diagnosis.hypotheses import Hypothesis, Members
+from ugat_marl.diagnosis.hypotheses import Hypothesis, Members, keys_of
 from ugat_marl.diagnosis.records import Proposed
 from ugat_marl.diagnosis.statistics import Distance, Reference, Whitener, softened, without_noise
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -103,10 +103,8 @@ def propose(
     """
     if not directions:
         return []
-    target = whitener.measured
     basis = [whitener(without_noise(x.difference, x.variance, thresholds)) for x in directions]
-    gram, match = _products(basis, target)
-    start = float(target @ target)
+    gram, match = _products(basis, whitener.measured)
     best: dict[tuple[object, ...], Proposed] = {}
     kept = list(range(len(directions)))
     for size in range(1, len(thresholds.candidates) + 1):
@@ -121,7 +119,7 @@ def propose(
             strengths = _least_squares(gram, match, chosen, signs, thresholds)
             if strengths is None:
                 continue
-            left = start - _taken_off(gram, match, chosen, strengths)
+            left = whitener.gap - _taken_off(gram, match, chosen, strengths)
             cost = left + thresholds.price * size
             if keys not in best or cost < best[keys].expected:
                 members = tuple(
@@ -200,15 +198,14 @@ def exchanges(
     """
     basis = [whitener(without_noise(x.difference, x.variance, thresholds)) for x in directions]
     gram, match = _products(basis, whitener.measured)
-    gap = float(whitener.measured @ whitener.measured)
-    present = {hypothesis.key for hypothesis, _ in members}
+    present = keys_of(members)
     absent = [k for k, one in enumerate(directions) if one.hypothesis.key not in present]
     out, moves = _of_members(members, directions)
     exchanged: list[Proposed] = []
     for key, gone in out.items():
         best: dict[object, Proposed] = {}
         stay = [move for other, move in moves.items() if other != key]
-        without, left = match - gram[gone], gap - 2 * match[gone] + gram[gone, gone]
+        without, left = match - gram[gone], whitener.gap - 2 * match[gone] + gram[gone, gone]
         goes = (directions[gone].hypothesis, directions[gone].level)
         for come in absent:
             chosen = [come, *stay]
@@ -224,7 +221,7 @@ def exchanges(
                 moved = zip(chosen, strengths.tolist(), strict=True)
                 values = ((directions[k].hypothesis, directions[k].at(x)) for k, x in moved)
                 best[comes.key] = Proposed((goes, *values), cost)
-        most = thresholds.near_share * gap + thresholds.near_cost
+        most = thresholds.near_share * whitener.gap + thresholds.near_cost
         most += thresholds.imitation_share * float(gram[gone, gone])
         near = [proposal for proposal in best.values() if proposal.expected <= most]
         exchanged += sorted(near, key=_cost)[: thresholds.exchanged]

@@ -19,6 +19,7 @@ from ugat_marl.diagnosis.hypotheses import (
     both_ways,
     cautious_drivers,
     effects_of,
+    keys_of,
     merged,
     title_of,
 )
@@ -163,11 +164,9 @@ class Selector:
 
     def _selected(self, best: Tested, located: Located, *, complete: bool) -> Selected:
         rivals = tuple(sorted(self._seen.values(), key=cost_of))
-        own = {hypothesis.key for hypothesis, _ in best.model.members}
-        keys = [{hypothesis.key for hypothesis, _ in x.members} for x in rivals]
+        keys = keys_of(best.model.members)
         # The same effects with a further one are no other explanation.
-        others = [x for x, its in zip(rivals, keys, strict=True)
-                  if its != own and not (own and its > own)]  # fmt: skip
+        others = [x for x in rivals if (x.members if not keys else not keys_of(x.members) >= keys)]
         worse_by = None
         if others:
             with contextlib.suppress(OutOfTime):  # the best model was not simulated on those days
@@ -267,9 +266,7 @@ class Selector:
         """Return the models that were simulated with none but the other members of a model."""
         kept = {h.key for index, (h, _) in enumerate(model.members) if index not in left_out}
         return [
-            part
-            for part in self._seen.values()
-            if part.members and {hypothesis.key for hypothesis, _ in part.members} <= kept
+            part for part in self._seen.values() if part.members and keys_of(part.members) <= kept
         ]
 
     def _round(self, start: Tested, number: int) -> Tested | None:
@@ -278,7 +275,7 @@ class Selector:
             self._library_directions(start.model, number), self._thresholds.between
         )
         whitener = self._whitener(start.model, WIDE)
-        gap = float(whitener.measured @ whitener.measured)
+        gap = whitener.gap
         chance = float(len(whitener.measured))  # expected squared length if only noise is left
         enough = chance + self._thresholds.look_elsewhere * max(gap - chance, 0.0)
         proposals = propose(directions, whitener, self._thresholds)
@@ -347,9 +344,8 @@ class Selector:
     def _explained_at_last(self, best: Tested) -> Tested:
         """Return a model that explains the data by effects that matter and are certain.
 
-        Without one it is the given one.
-
-        It is fitted from two starting points that a search by single steps may miss.
+        It is fitted from two starting points that a search by single steps may miss. If neither
+        leads to such a model, the given one is returned.
         """
         for start in (self._with_clear_effect, self._as_cautious_drivers):
             if (model := start(best)) is None:
@@ -372,7 +368,7 @@ class Selector:
         simulated are compared by the latter.
         """
         directions = self._directions(best.model, self._library, self._thresholds.rounds)
-        present = {hypothesis.key for hypothesis, _ in best.model.members}
+        present = keys_of(best.model.members)
         proposals = propose(directions, self._whitener(best.model, WIDE), self._thresholds)
         clear = [hypothesis for ((hypothesis, _), *more) in (x.members for x in proposals)
                  if not more and hypothesis.key not in present]  # fmt: skip
@@ -388,14 +384,13 @@ class Selector:
         """
         found = tuple(member for member in best.model.members if member[0].name in CAUTION)
         mild, *_ = cautious_drivers(self._library) or [()]
-        if not found or len(found) == len(mild) or not mild:
+        if not 0 < len(found) < len(mild):
             return None
         return self._fitter.simulate(merged(mild, found))
 
     def _gap_of_network(self, model: Fitted) -> float:
         """Return the squared distance of the statistics of the whole network."""
-        measured = self._whitener(model, WIDE).measured
-        return float(measured @ measured)
+        return self._whitener(model, WIDE).gap
 
     def _nearest(self) -> list[Members]:
         """Return the simulated single effects of the library that come nearest to the data.
@@ -565,5 +560,5 @@ class Selector:
 
 def _is_exchange(model: Fitted, before: Fitted) -> bool:
     """Return True if a model has an effect that another one lacks, and as many as it at most."""
-    new, old = ({hypothesis.key for hypothesis, _ in one.members} for one in (model, before))
+    new, old = keys_of(model.members), keys_of(before.members)
     return len(new) <= len(old) and not new <= old

@@ -676,6 +676,11 @@ class Whitener:
             rows.append(whitened(differences[name] / scale, groups))
         return np.concatenate(rows)
 
+    @property
+    def gap(self) -> float:
+        """Squared length of `measured`, about its number of statistics if only noise is left."""
+        return float(self.measured @ self.measured)
+
 
 def correlation_groups(used: NDArray[np.bool_], correlation: Array) -> list[Group]:
     """Group members that use the same features.

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc
 
 from ugat_marl.diagnosis.features import ALL_FEATURES, DetectorLayout
-from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members
+from ugat_marl.diagnosis.hypotheses import WINDOW, Hypothesis, Members, keys_of
 from ugat_marl.diagnosis.measurement import DetectorError
 from ugat_marl.diagnosis.places import one_behind_the_other
 from ugat_marl.diagnosis.records import (
@@ -247,11 +246,6 @@ def _at_an_end(members: Members) -> str:
             if value in {ranges[name].low, ranges[name].high} - natural:
                 texts.append(f"{hypothesis.name.replace('_', ' ')} of {value:g}")
     return " and ".join(texts)
-
-
-def keys_of(members: Members) -> set[tuple[Any, ...]]:
-    """Return names and places of the effects of a model."""
-    return {hypothesis.key for hypothesis, _ in members}
 
 
 def _look_at(selection: Selected) -> str | None:

@@ -18,7 +18,7 @@ import numpy as np
 from ugat_marl.data import MeasuredData, installed_versions
 from ugat_marl.diagnosis.detection_limits import detection_limits
 from ugat_marl.diagnosis.engine import OutOfTime
-from ugat_marl.diagnosis.hypotheses import WINDOW, Members
+from ugat_marl.diagnosis.hypotheses import WINDOW, Members, keys_of
 from ugat_marl.diagnosis.locate import disagreements, locate_gap
 from ugat_marl.diagnosis.patterns import unnamed_effects
 from ugat_marl.diagnosis.places import Routes
@@ -57,7 +57,6 @@ from ugat_marl.diagnosis.verdict import (
     describe_errors,
     describe_pattern,
     effect_record,
-    keys_of,
     parameter,
     unchallenged,
     unverified,
