@@ -110,6 +110,15 @@ def test_a_wrong_call_is_one_line_with_the_nearest_name(
     assert says in complaint(capsys, *arguments)
 
 
+@pytest.mark.parametrize("value", ["99:30", "-7:05", "7:75", "1:2:3:04"])
+def test_what_is_no_time_of_day_is_not_translated(
+    value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = complaint(capsys, "train", "single-v1", f"--rollout-epsilon={value}")
+    assert "not a number" in said
+    assert "time of day" not in said
+
+
 @pytest.mark.parametrize(
     ("arguments", "unused"),
     [

@@ -334,7 +334,7 @@ def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, DetectorL
     bins[BIN_FEATURES.index("count_stop"), place] = (6.0, 2.0)
     none = {edge: np.zeros(2) for _, edge, _ in layout.places}
     due = DemandBalance(none | {"S_C": np.array([9.0, 3.0])}, none | {"S_C": np.array([5.0, 5.0])})
-    found = corrected(Tally(sums, bins), layout, due)
+    found = corrected(Tally(sums, bins), layout, due, {})
     # 8 of 10 that came were counted, so 8 of 10 of the two more that were due would have been.
     assert found.sums[INDEX["count_stop"], place].tolist() == pytest.approx([9.6, 10.0])
     assert found.bins[BIN_FEATURES.index("count_stop"), place].tolist() == pytest.approx([9.2, 0.4])
@@ -344,10 +344,10 @@ def test_counts_are_those_asked_for(crossing: tuple[Scenario, Network, DetectorL
 def test_turning_counts_are_those_asked_for(
     crossing: tuple[Scenario, Network, DetectorLayout],
 ) -> None:
-    """One was counted in the first half of the first bin, the other in the whole second bin."""
+    """In the first half of the first bin, in the whole second bin, and not at all."""
     _, _, layout = crossing
     sums = np.zeros((len(FEATURES), len(layout.places), 2))
-    turning = np.array([[[4.0, 5.0]], [[2.0, 5.0]]])
+    turning = np.array([[[4.0, 5.0]], [[2.0, 5.0]], [[0.0, 0.0]]])
     day = Tally(
         sums,
         np.zeros((len(BIN_FEATURES), len(layout.places), 2)),
@@ -357,9 +357,11 @@ def test_turning_counts_are_those_asked_for(
     edges = {edge: np.zeros(2) for _, edge, _ in layout.places}
     asked = edges | {"S_C C_N": np.array([12.0, 16.0]), "W_C C_E": np.array([1.0, 0.0])}
     given = edges | {"S_C C_N": np.array([10.0, 10.0]), "W_C C_E": np.array([9.0, 9.0])}
+    asked["E_C C_W"], given["E_C C_W"] = np.array([7.0, 7.0]), np.array([6.0, 6.0])
     spans = {("S_C", "C_N"): [(0.0, 300.0)], ("W_C", "C_E"): [(600.0, 900.0), (900.0, 1200.0)]}
+    spans["E_C", "C_W"] = []
     found = corrected(day, layout, DemandBalance(asked, given), spans)
-    assert found.supplementary[TURNING].tolist() == [[[4.0 + 2.0 / 2, 5.0]], [[0.0, 5.0]]]
+    assert found.supplementary[TURNING][:, 0].tolist() == [[4.0 + 2.0 / 2, 5.0], [0.0, 5.0], [0, 0]]
     assert day.supplementary[TURNING] is turning and turning[0, 0, 0] == 4.0
 
 
@@ -383,7 +385,7 @@ def test_of_vehicles_between_two_lights_both_count_all() -> None:
     sums, bins = np.zeros((len(FEATURES), 4, 2)), np.zeros((len(BIN_FEATURES), 4, 2))
     sums[INDEX["count_stop"], :2, 1] = sums[INDEX["count_exit"], 2:, 1] = 60.0
     due = DemandBalance({"e": np.array([10.0, 10.0])}, {"e": np.zeros(2)})
-    found = corrected(Tally(sums, bins), layout, due).sums
+    found = corrected(Tally(sums, bins), layout, due, {}).sums
     assert found[INDEX["count_stop"], :, 0].tolist() == [10.0, 10.0, 0.0, 0.0]
     assert found[INDEX["count_exit"], :, 0].tolist() == [0.0, 0.0, 10.0, 10.0]
 

@@ -29,6 +29,7 @@ from ugat_marl.diagnosis.features import (
     Tally,
     bins_in,
 )
+from ugat_marl.diagnosis.intervals import overlap_s
 from ugat_marl.diagnosis.journeys import Crossings, matched
 from ugat_marl.diagnosis.supplementary_data import TURNING, Span
 from ugat_marl.diagnosis.thresholds import DayThresholds
@@ -382,7 +383,7 @@ def corrected(
     counted: Tally,
     layout: DetectorLayout,
     due: DemandBalance,
-    spans: Mapping[tuple[str, str], Sequence[Span]] | None = None,
+    spans: Mapping[tuple[str, str], Sequence[Span]],
 ) -> Tally:
     """Return the tally of a day, with counts corrected to the model's demand.
 
@@ -415,22 +416,16 @@ def corrected(
                 bins[line, place, :width] += share * more[:width]
     sums[[INDEX[name] for name in PLATOON_FEATURES]] = 0.0
     supplementary = dict(counted.supplementary)
-    if TURNING in supplementary and counted.window is not None and spans is not None:
+    if TURNING in supplementary and counted.window is not None:
         supplementary[TURNING] = turning = supplementary[TURNING].copy()
         for member, (turn, intervals) in enumerate(spans.items()):
             more = due.asked[" ".join(turn)] - due.given[" ".join(turn)]
-            own = float(_shares_of_bins(intervals, counted.window, len(more)) @ more)
+            edges = np.linspace(*counted.window, len(more) + 1)
+            begin_s, end_s = np.reshape(np.asarray(intervals, np.float64), (-1, 2)).T
+            shares = overlap_s(begin_s, end_s, edges).sum(axis=0) / np.diff(edges)
+            own = float(shares @ more)
             turning[member, 0, 0] = max(turning[member, 0, 0] + own, 0.0)
     return replace(counted, sums=sums, bins=np.maximum(bins, 0.0), supplementary=supplementary)
-
-
-def _shares_of_bins(intervals: Sequence[Span], window: Span, bins: int) -> Array:
-    """Return the part of each bin of a period that intervals cover, ``(bins,)``."""
-    times = np.linspace(*window, bins + 1)
-    covered = np.zeros(bins)
-    for begin_s, end_s in intervals:
-        covered += np.diff(np.clip(times, begin_s, end_s))
-    return covered / np.diff(times)
 
 
 def _approaches(layout: DetectorLayout, thresholds: DayThresholds) -> dict[str, tuple[_Lane, ...]]:

@@ -296,9 +296,9 @@ class Engine:
         head += ("intervals/2", interval_s) if interval_s else ()
         head += (supplementary,) if supplementary else ()
         self._root = hashlib.sha256(repr(head).encode()).hexdigest()
-        self._turns = () if supplementary is None else supplementary.turns
+        turns = () if supplementary is None else supplementary.turns
         edges = {edge for _, edge, _ in layout.places}
-        self._balanced = sorted(edges | set(map(" ".join, self._turns)))
+        self._balanced = sorted(edges | set(map(" ".join, turns)))
         self._signals = [_signals_hash(period, replay.answering) for period in periods]
         self._known_by: Callable[[], None] | None = None
         self._detection: tuple[Effect, ...] = ()
@@ -580,11 +580,9 @@ class Engine:
         if due is None:
             return Replicate(counted, travel_time_s)
         measured = self._supplementary
-        spans = None
-        if measured is not None and counted.period is not None:
-            spans = dict(zip(measured.turns, measured.spans[counted.period], strict=True))
-        tally = corrected(counted, self.layout, due, spans)
-        return Replicate(tally, travel_time_s, counted, due)
+        period = counted.period
+        spans = {} if measured is None or period is None else measured.spans_of_turns(period)
+        return Replicate(corrected(counted, self.layout, due, spans), travel_time_s, counted, due)
 
     def _day(self, effects: tuple[Effect, ...], number: int) -> Day:
         """Return a day as the detectors saw it; faults of detectors need no new simulation."""

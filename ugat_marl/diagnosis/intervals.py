@@ -90,7 +90,7 @@ def with_intervals(
     for name, (feature, place) in layout.counted.items():
         reports = Intervals.of(period.of_detector(name), period, length_s)
         _enter(sums, feature, place, reports, length_s)
-        _share_out(bins, feature, place, reports, _inside(reports, edges))
+        _share_out(bins, feature, place, reports, overlap_s(reports.begin_s, reports.end_s, edges))
     return replace(counted, sums=sums, bins=bins)
 
 
@@ -207,15 +207,16 @@ def _enter(sums: Array, feature: str, place: int, intervals: Intervals, length_s
         sums[INDEX[f"{name}_{kind}"], place] = values
 
 
-def _inside(reports: Intervals, edges: Array) -> Array:
+def overlap_s(begin_s: Array, end_s: Array, edges: Array) -> Array:
     """Return how much of each interval lies in each bin, s, ``(intervals, bins)``.
 
     Args:
-        reports: Reports of a detector.
+        begin_s: Start of each interval, s.
+        end_s: End of each interval, s.
         edges: Bounds of the bins, s.
     """
-    begin = np.maximum(edges[:-1], reports.begin_s[:, None])
-    end = np.minimum(edges[1:], reports.end_s[:, None])
+    begin = np.maximum(edges[:-1], begin_s[:, None])
+    end = np.minimum(edges[1:], end_s[:, None])
     return np.clip(end - begin, 0.0, None)
 
 
@@ -296,7 +297,7 @@ def counts_tally(
             sums[INDEX[feature], place] = reports.vehicles.sum(), minutes
         if name in whole and length_s is not None:
             _enter(sums, feature, place, reports, length_s)
-        inside = _inside(reports, edges)
+        inside = overlap_s(reports.begin_s, reports.end_s, edges)
         _share_out(bins, feature, place, reports, inside)
         covered[BIN_FEATURES.index(feature), place] = inside.sum(axis=0)
         if feature == "count_advance":

@@ -134,6 +134,10 @@ class SupplementaryData:
         }
         return {name: members for name, members in labels.items() if members}
 
+    def spans_of_turns(self, period: str) -> dict[tuple[str, str], tuple[Span, ...]]:
+        """Return start and end of the counted intervals of each turn in a measured period, s."""
+        return dict(zip(self.turns, self.spans[period], strict=True))
+
     def measured(self, period: str) -> dict[str, Array]:
         """Return sums and numbers of observations of a measured period, by block.
 
