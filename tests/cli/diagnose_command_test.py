@@ -576,10 +576,10 @@ def test_demand_that_does_not_reach_the_detectors_is_told(
 @pytest.mark.parametrize(
     ("more", "says"),
     [
-        (("--alpha", "0.7"), "alpha = 0.7"),
-        (("--budget-s", "0"), "budget_s = 0"),
-        (("--budget-s", "nan"), "budget_s"),
-        (("--seed", "-1"), "seed = -1"),
+        (("--alpha", "0.7"), "--alpha 0.7"),
+        (("--budget-s", "0"), "--budget-s 0"),
+        (("--budget-s", "nan"), "--budget-s nan"),
+        (("--seed", "-1"), "--seed -1"),
         (("--workers", "0"), "--workers 0: must be at least 1"),
         (("--budgets", "3"), "'--budget-s'"),
     ],

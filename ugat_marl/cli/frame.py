@@ -124,7 +124,10 @@ def run(line: CommandLine, arguments: Sequence[str]) -> int:
 
     def perform() -> int:
         with loudness(level), showing(Bars(progress)), _deadline(seconds):
-            return _dispatch(line, list(arguments), console)
+            try:
+                return _dispatch(line, list(arguments), console)
+            except UgatMarlError as error:
+                raise UgatMarlError(_as_typed(str(error), arguments)) from error
 
     return guarded(line.program, perform)
 
@@ -194,6 +197,31 @@ def guarded(program: str, call: Callable[[], int | None]) -> int:
             file=sys.stderr,
         )
         return USAGE_ERROR
+
+
+def _as_typed(message: str, words: Sequence[str]) -> str:
+    """Return a message with options as they were typed, for settings as they are called in Python.
+
+    ``fit learning_rate is inf`` becomes ``--fit.learning-rate inf``.
+    """
+    typed = [word for given in words for word in given.split("=", 1)]
+    for option, value in dict(zip(typed, typed[1:], strict=False)).items():
+        group, _, name = option.removeprefix("--").replace("-", "_").rpartition(".")
+        if not option.startswith("--") or not name.isidentifier():
+            continue
+        owner = rf"(?:{re.escape(group)} |\w+Config\.)?" if group else ""
+        for found in re.finditer(rf"\b{owner}{name} (?:=|is) ([^\s:;,]+)", message):
+            if _same(found[1], value):
+                return message.replace(found[0], f"{option} {value}")
+    return message
+
+
+def _same(shown: str, typed: str) -> bool:
+    """Return True if a message shows the value that was typed: 2.0 for 2."""
+    try:
+        return shown.strip("'") == typed or float(shown) == float(typed)
+    except ValueError:
+        return False
 
 
 def _in_one_line(text: str) -> str:
