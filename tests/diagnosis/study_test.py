@@ -34,7 +34,10 @@ from ugat_marl.diagnosis.thresholds import Effort, Thresholds
 from ugat_marl.diagnosis.unmeasured import Unmeasured
 from ugat_marl.effects import (
     DetectorExtension,
+    DetectorOffset,
     DetectorPulse,
+    DetectorSpeeds,
+    DetectorZone,
     Effect,
     Headway,
     load_scenario,
@@ -242,6 +245,43 @@ def test_what_measured_arrivals_leave_open_is_a_matter_of_the_model() -> None:
     assert within["lane"][place] == pytest.approx((THRESHOLDS.arrivals_error_share * 3.0) ** 2)
     found.doubt((Headway(1.5),))
     assert own.asked == other.asked == [(), (Headway(1.5),)]
+
+
+@dataclass
+class Positions(Days):
+    """The same days as detectors 10 m upstream see them, within 2 m."""
+
+    metres: float = -10.0
+
+    def first(self, count: int) -> list[int]:
+        return [n for n in range(count + len(self.aside)) if n not in self.aside]
+
+    def detecting(self, errors: Sequence[Any]) -> Positions:
+        (error,) = errors
+        return replace(self, metres=error.metres)
+
+    def replicates(self, effects: Sequence[Effect], numbers: Sequence[int]) -> list[Any]:
+        stands_on_it = self.metres < -11.0  # only farther upstream a vehicle stands over the loop
+        counts = {key: value + stands_on_it for key, value in self.counts.items()}
+        return list(replace(self, counts=counts).ordinary(effects, numbers).values())
+
+
+def test_what_the_position_of_a_detector_leaves_open_is_a_matter_of_the_model() -> None:
+    own = Positions({False: 8.0, True: 6.0}, aside=(2, 3))
+    offset = DetectorOffset("advance", metres=-10.0)
+    found = replace(study(own, None), detection=(DetectorError(offset, 2.0),))
+    for effects in ((), (Headway(1.5),)):
+        doubt = found.doubt(effects)
+        assert doubt is not None
+        assert doubt["lane"][0, INDEX["count_stop"]] == pytest.approx(1.0**2 / 2)
+    certain = replace(found, detection=(DetectorError(DetectorPulse("advance", 0.5)),))
+    assert certain.doubt() is None
+
+
+def test_the_ends_of_an_error_of_detectors_are_plausible() -> None:
+    zone = DetectorError(DetectorZone("stop", metres=-29.5), 1.0)
+    assert zone.ends == [DetectorZone("stop", metres=-30.0), DetectorZone("stop", metres=-28.5)]
+    assert DetectorError(DetectorSpeeds("stop", "rear")).ends == []
 
 
 def test_where_signals_answered_nobody_nothing_is_left_open() -> None:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -102,6 +102,18 @@ class DetectorError:
     effect: Effect
     margin: float | None = None
     rival: Effect | None = None
+
+    @property
+    def ends(self) -> list[Effect]:
+        """The error at both ends of its interval, within its range; none without a number."""
+        if not self.margin:
+            return []
+        ((name, plausible),) = self.effect.ranges.items()
+        value = getattr(self.effect, name)
+        return [
+            replace(self.effect, **{name: plausible.nearest(value + sign * self.margin)})
+            for sign in (-1.0, 1.0)
+        ]
 
     @property
     def kind_and_place(self) -> tuple[str | None, ...]:

@@ -6,7 +6,7 @@ import functools
 import itertools
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -593,35 +593,71 @@ class Study:
         )
 
     def doubt(self, effects: tuple[Effect, ...] = ()) -> Mapping[str, Array] | None:
-        """Return variances for errors of the measured arrivals, by block.
+        """Return variances for errors of arrivals and of detectors that stay unknown, by block.
 
-        Detectors see arrivals near the traffic lights, not at the end of queues. So arrivals in
-        long queues are known only roughly. The error is estimated by days with the model's own
-        arrivals. It depends on the length of queues, so each model has its own.
+        Each model has its own, since they depend on the length of queues.
 
         Args:
             effects: Effects of the model; none for the scenario as it is.
 
         Returns:
-            None if no measured arrivals are used.
+            None if no measured arrivals are used and no detector errs by an uncertain number.
 
         Raises:
             OutOfTime: The budget does not suffice.
         """
-        if self.other_days is None:
-            return None
         if effects not in self._doubts:
-            numbers = range(min(self.config.thresholds.doubt_days, self.effort.base))
-            replayed = self.engine.ordinary(effects, numbers)
-            other = self.other_days.ordinary(effects, numbers)
-            both = [number for number in replayed if number in other]
-            days = [[model[number].tally for number in both] for model in (replayed, other)]
-            apart, _ = change_between(self.pools, *days)
+            doubts = [*self._doubts_of_arrivals(effects), *self._doubts_of_detectors(effects)]
             self._doubts[effects] = {
-                name: (self.config.thresholds.arrivals_error_share * values) ** 2
-                for name, values in apart.items()
+                name: np.sum([doubt[name] for doubt in doubts], axis=0)
+                for name in (doubts[0] if doubts else ())
             }
-        return self._doubts[effects]
+        return self._doubts[effects] or None
+
+    def _doubts_of_arrivals(self, effects: tuple[Effect, ...]) -> Iterator[dict[str, Array]]:
+        """Yield variances for errors of the measured arrivals, if these are used.
+
+        Detectors see arrivals near the traffic lights, not at the end of queues. So arrivals in
+        long queues are known only roughly. The error is estimated by days with the model's own
+        arrivals.
+        """
+        if self.other_days is None:
+            return
+        numbers = range(min(self.config.thresholds.doubt_days, self.effort.base))
+        replayed = self.engine.ordinary(effects, numbers)
+        other = self.other_days.ordinary(effects, numbers)
+        both = [number for number in replayed if number in other]
+        share = self.config.thresholds.arrivals_error_share
+        yield self._squared_change(
+            [other[number].tally for number in both],
+            [replayed[number].tally for number in both],
+            share**2,
+        )
+
+    def _doubts_of_detectors(self, effects: tuple[Effect, ...]) -> Iterator[dict[str, Array]]:
+        """Yield the variance by each error of detectors: that between the ends of its interval.
+
+        A loop a metre farther on may lie under a standing vehicle, and not between two. So single
+        statistics change by far more than by chance within the interval of a position.
+        """
+        ends = [(error, end) for error in self.detection for end in error.ends]
+        if not ends:
+            return
+        numbers = self.engine.first(min(self.config.thresholds.measurement_days, self.effort.base))
+        known = self.engine.ordinary(effects, numbers)
+        for error, end in ends:
+            errors = [end if other is error else other.effect for other in self.detection]
+            days = self.engine.detecting(errors).replicates(effects, list(known))
+            yield self._squared_change(
+                [day.tally for day in days], [day.tally for day in known.values()], 0.5
+            )
+
+    def _squared_change(
+        self, after: Sequence[Tally], before: Sequence[Tally], share: float
+    ) -> dict[str, Array]:
+        """Return a share of the squared change of the statistics between two models, by block."""
+        apart, _ = change_between(self.pools, after, before)
+        return {name: share * values**2 for name, values in apart.items()}
 
     @functools.cached_property
     def place_finder(self) -> PlaceFinder:
