@@ -16,13 +16,16 @@ from ugat_marl.diagnosis.patterns import (
     _spread,
     cells_of,
     patterns,
+    place_sets,
     sets_of,
     unnamed_effects,
 )
 from ugat_marl.diagnosis.records import Pattern
 from ugat_marl.diagnosis.thresholds import Thresholds
 from ugat_marl.diagnosis.verdict import describe_pattern
-from ugat_marl.scenarios import Detector, DetectorKind, Passages, Period
+from ugat_marl.effects import load_scenario
+from ugat_marl.scenarios import Detector, DetectorKind, Network, Passages, Period
+from ugat_marl.simulation import standard_detectors
 
 THRESHOLDS = Thresholds()
 HOUR_S = 3600.0
@@ -211,6 +214,23 @@ def test_the_sets_of_every_axis() -> None:
     assert sets["length"].names == (None, ("long",))
 
 
+def test_a_lane_between_two_lights_is_a_place_in_front_of_one_and_behind_the_other() -> None:
+    scenario = load_scenario("grid2x2-v1")
+    network = Network.read(scenario)
+    layout = DetectorLayout.of(network, standard_detectors(network))
+    sets = place_sets(layout, len(layout.places))
+    lanes = [lane for _, _, lane in layout.places]
+    inner, outer = "A2_A1_0", "A1_west1_0"
+    first = lanes.index(inner)
+    second = lanes.index(inner, first + 1)
+    for lane, kind, place in (
+        (inner, "lane", first),
+        (inner, "exit", second),
+        (outer, "lane", lanes.index(outer)),
+    ):
+        assert np.flatnonzero(sets.masks[sets.names.index((lane, kind))]).tolist() == [place]
+
+
 def test_a_pattern_in_words() -> None:
     pattern = Pattern(
         "count", "north", None, "advance", None, None, None, False, 0.18, 0.01, None, 0.0
@@ -219,6 +239,10 @@ def test_a_pattern_in_words() -> None:
         describe_pattern(pattern) == "Advance detectors of approach north count 18 % more vehicles"
     )
     lane = replace(pattern, quantity="discharge", place="north_1", movement="lane", detectors=None)
+    behind = replace(pattern, place="north_1", movement="exit", detectors=None)
+    assert describe_pattern(behind) == (
+        "The detectors of lane north_1 behind the intersection count 18 % more vehicles"
+    )
     late = replace(lane, green_s=(20.0, None), change=-0.3)
     assert describe_pattern(late) == "Lane north_1 discharges 30 % less after 20 s of green"
     early = replace(lane, green_s=(None, 10.0), vehicles=(None, 3.0), place=None, movement="l")

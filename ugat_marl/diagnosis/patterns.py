@@ -203,8 +203,11 @@ def place_sets(layout: DetectorLayout, width: int) -> AxisSets:
     named |= {("", letter): (mask, 1) for letter, mask in moving.items()}
     for edge, letter in itertools.product(on, moving):
         named[edge, letter] = on[edge] & moving[letter], 2
+    incoming = {lane.id for lane in layout.lanes}
     for index, (_, _, lane) in enumerate(places):
-        named[lane, "lane"] = np.arange(len(places)) == index, 2
+        # A lane between two lights is two places: in front of one of them, and behind the other.
+        behind = index >= len(layout.lanes) and lane in incoming
+        named[lane, "exit" if behind else "lane"] = np.arange(len(places)) == index, 2
     return AxisSets.of(len(places), named)
 
 

@@ -598,7 +598,8 @@ class Pattern:
         quantity: ``discharge``, ``free speed`` or ``count``.
         place: SUMO id of an edge or a lane; None for all.
         movement: ``s`` straight, ``l`` left, ``r`` right: lanes of this movement alone; ``lane`` if
-            `place` is a lane; None for all lanes.
+            `place` is a lane; ``exit`` if it is a lane of which the detectors behind an
+            intersection differ, and that leads to another one; None for all lanes.
         detectors: Kind of detectors that differ; None for all.
         vehicles: First and last position in the queue; None for no limit.
         green_s: Least and largest age of green, s; None for no limit.

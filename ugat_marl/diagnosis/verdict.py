@@ -417,8 +417,9 @@ def describe_pattern(pattern: Pattern) -> str:
 
 def _whereabouts(pattern: Pattern) -> tuple[str, bool]:
     """Return the place of a pattern in words, and True if it is a single thing."""
-    if pattern.movement == "lane":
-        return f"lane {pattern.place}", True
+    if pattern.movement in ("lane", "exit"):
+        behind = " behind the intersection" if pattern.movement == "exit" else ""
+        return f"lane {pattern.place}{behind}", True
     if pattern.movement is None:
         return (f"approach {pattern.place}", True) if pattern.place else ("all lanes", False)
     lanes = f"the {_MOVEMENTS.get(pattern.movement, 'lanes')}"
