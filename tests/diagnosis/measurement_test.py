@@ -12,7 +12,7 @@ import pytest
 
 from ugat_marl.diagnosis import sightings
 from ugat_marl.diagnosis.features import DetectorLayout, Greens, IncomingLane
-from ugat_marl.diagnosis.measurement import Measurement
+from ugat_marl.diagnosis.measurement import Measurement, _grain_s
 from ugat_marl.diagnosis.sightings import (
     ALONE,
     FOURTH,
@@ -574,7 +574,14 @@ def test_sightings_are_stored_and_read() -> None:
     assert len((one + again).pairs) == 2 * len(one.pairs) > 0
 
 
-@pytest.mark.parametrize(("grain_s", "seen"), [(0.1, True), (1.0, False)])
+@pytest.mark.parametrize("grain_s", [0.1, 0.2, 0.25, 0.3, 0.4, 0.5, 1.0])
+def test_the_grain_of_a_clock(grain_s: float) -> None:
+    stamps = np.round(grain_s * np.array([2, 3, 5, 8, 13, 40]), 3)
+    assert _grain_s(stamps) == grain_s
+    assert _grain_s(stamps + np.array([0.0, 0.01, 0.0, 0.03, 0.0, 0.0])) == 0.0
+
+
+@pytest.mark.parametrize(("grain_s", "seen"), [(0.1, True), (0.3, False), (1.0, False)])
 def test_coarse_clocks(grain_s: float, seen: bool) -> None:
     usual = together([day(seed) for seed in range(3)])
 

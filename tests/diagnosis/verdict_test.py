@@ -45,6 +45,7 @@ PARKING = Hypothesis(
 )
 MODEL = Hypothesis("driver_model", (("model", "IDM"),), (), ((),), None)
 DETECTORS = [
+    Detector("from", "E_C_0", 5.0, 2.0, "exit"),  # behind another light
     Detector("east", "E_C_0", 10.0, 2.0, "advance"),
     Detector("line", "E_C_0", 90.0, 2.0, "stop"),
     Detector("beside", "E_C_1", 90.0, 2.0, "stop"),
@@ -279,6 +280,8 @@ def short(place: str) -> tuple[Hypothesis, tuple[float, ...]]:
         (("out", "east"), ("east", "out")),
         (("line", "east"), ("east", "line")),
         (("away", "out", "beside"), ("beside", "away")),
+        (("east", "from"), ("from", "east")),
+        (("line", "from"), ("from", "line")),
         (("line", "away"), None),
         (("line", "beside"), None),
         (("out", "away"), None),

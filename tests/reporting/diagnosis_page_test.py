@@ -347,6 +347,13 @@ def test_the_policy_gap_is_shown_where_it_was_measured(network: Network) -> None
     page = Page(diagnosis_page(diagnosis_of(policy_gap=GAP), network))
     for cell in ("max-pressure:20", "100 (98 to 102)", "148", "51", "94 %"):
         assert cell in page.text
+    assert "Average travel time with 95 % intervals. Before" in page.text
+    single = {"low": None, "high": None}
+    once = {name: gap | {"sim": gap["sim"] | single} for name, gap in GAP.items()}
+    assert (
+        "Average travel time. Before"
+        in Page(diagnosis_page(diagnosis_of(policy_gap=once), network)).text
+    )
 
 
 def test_a_page_tells_its_commands(network: Network, tmp_path: Path) -> None:
@@ -387,6 +394,16 @@ def test_criteria_of_a_correction_that_is_not_there_are_left_out() -> None:
         assert table is not None
         assert any(row[-1] != "–" for row in table.rows) is there
         assert any(row[-2] != "–" for row in table.rows)
+
+
+def test_the_traffic_check_is_shown_where_no_approach_could_be_measured(network: Network) -> None:
+    of_counts = diagnosis_of(approaches=[])
+    text = Page(diagnosis_page(of_counts, network)).text
+    assert "In terms of traffic" in text
+    assert "travel time and queue" in text
+    assert "Between the advance and the stop detectors" not in text
+    unnamed = diagnosis_of("unknown", unnamed=content_of()["effects"][:1])
+    assert "after: with the unnamed correction" in Page(diagnosis_page(unnamed, network)).text
 
 
 def test_nothing_held_out_is_said(network: Network) -> None:

@@ -195,6 +195,14 @@ def test_the_radar_of_a_table_has_every_grounding() -> None:
     ]
 
 
+def test_variants_push_nothing_off_the_radar() -> None:
+    variants = [variant_name("timed", f"α = {k}") for k in range(9)]
+    labels = [DIRECT, GROUNDED_NAME["timed"], *variants, GROUNDED_NAME["street"], ORACLE, RULE]
+    lines = training_page._radar_lines(labels, {(label, "V4"): {} for label in labels}, "V4")
+    kept = (DIRECT, GROUNDED_NAME["timed"], GROUNDED_NAME["street"], ORACLE, RULE)
+    assert [*lines][1:] == [f"{label} in V4" for label in kept]
+
+
 def test_a_radar_shows_a_grounding_whose_alpha_does_not_follow_u() -> None:
     fixed, ungated = variant_name("phase", "α = 0.3"), variant_name("timed", "no gate")
     labels = [DIRECT, fixed, ungated, matched_name("timed")]

@@ -81,11 +81,11 @@ def _grain_s(times: Array) -> float:
     """
     if not len(times) or np.ptp(times) < 0.05:
         return 0.0
-    for grain in (1.0, 0.5, 0.2, 0.1):
-        steps = times / grain
-        if bool((np.abs(steps - np.round(steps)) < 0.01).all()):
-            return grain
-    return 0.0
+    known = np.unique(np.round(times, 3))
+    grain = float(np.diff(known, prepend=0.0)[known > 0].min())  # no difference is smaller
+    steps = times / grain
+    is_grain = grain >= 0.1 - 1e-6 and bool((np.abs(steps - np.round(steps)) < 0.01).all())
+    return round(grain, 3) if is_grain else 0.0
 
 
 @dataclass(frozen=True)

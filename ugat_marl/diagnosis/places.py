@@ -1001,12 +1001,12 @@ def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str,
     for one in suspects:
         for other in suspects:
             lane, edge = lanes.get(one.lane), edge_of_lane(other.lane)
-            if lane is None:
-                continue
+            on_one_edge = edge == edge_of_lane(one.lane)
             if other.kind == "exit":
-                behind = one.kind != "exit" and edge in lane.following
+                behind = one.kind != "exit" and lane is not None and edge in lane.following
             else:
-                behind = (one.kind, other.kind) == ("advance", "stop") and edge == lane.edge
+                order = ("exit", "advance", "stop")
+                behind = on_one_edge and order.index(one.kind) < order.index(other.kind)
             if behind:
                 return one.id, other.id
     return None

@@ -113,6 +113,9 @@ def diagnosis_page(diagnosis: Diagnosis, network: Network, commands: Sequence[st
         headways=_headways(page, diagnosis),
         criteria=words.criteria_line(diagnosis),
         policy_gap=_policy_gap(diagnosis),
+        policy_gap_intervals=any(
+            gap.sim.low is not None for gap in (diagnosis.policy_gap or {}).values()
+        ),
         data=_data(diagnosis),
         commands=commands or _usual_commands(diagnosis),
         provenance=_provenance(diagnosis),

@@ -24,11 +24,11 @@ MOST_DOMAINS = 6
 """Most domains side by side, for the same reason."""
 LEGEND = (
     "Mean control delay in s: what all vehicles on an approach lose, those that still wait at the "
-    "end included, per vehicle that passed the light (veh: how many, fewest and most of the "
-    "policies). Level of service of the Highway Capacity "
+    "end included, per vehicle that passed the light. Level of service of the Highway Capacity "
     "Manual: A to 10 s, B to 20, C to 35, D to 55, E to 80, F above. Vehicles that wait outside "
     "the network do not count, nor do approaches that nobody passed."
 )
+_PASSED = "veh: vehicles that passed the light, fewest and most of the policies."
 
 Delays = Mapping[str, tuple[float, float]]
 """Approach to the number of vehicles that passed and their mean control delay, s."""
@@ -129,7 +129,7 @@ def control_delay_table(
             cells = ["-" if at is None else approach_text(*at) for at in passed]
             table.add_row(Text(light), Text(approach), Text(road), count, *cells)
         tables.append(table)
-    return Group(*tables, Text(LEGEND, style="dim"))
+    return Group(*tables, Text(f"{LEGEND} {_PASSED}", style="dim"))
 
 
 def service_grid(

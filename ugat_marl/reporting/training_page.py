@@ -307,9 +307,10 @@ def _cell(row: Mapping[str, Any], key: str, *, sign: bool) -> str:
 def _radar_lines(labels: Sequence[str], cells: charts.Cells, domain: str) -> dict[str, list[float]]:
     grounded = (charts.row_of(grounding, labels) for grounding in GROUNDED_NAME)
     begins = (DIRECT, *grounded, ORACLE, RULE)  # of a row's label, each with room for one line
-    shown = [label for label in labels if label.startswith(begins) and (label, domain) in cells]
+    known = [label for label in labels if (label, domain) in cells]
+    first = (next((x for x in known if x.startswith(begin)), None) for begin in begins)
     lines: dict[str, list[float]] = {}
-    for place, label in enumerate(shown[: len(begins)]):
+    for place, label in enumerate(x for x in first if x is not None):
         row = cells[label, domain]
         if place == 0:
             lines[f"{label} in the simulation"] = [
