@@ -282,7 +282,7 @@ def short(place: str) -> tuple[Hypothesis, tuple[float, ...]]:
         (("away", "out", "beside"), ("beside", "away")),
         (("east", "from"), ("from", "east")),
         (("line", "from"), ("from", "line")),
-        (("line", "away"), None),
+        (("line", "away"), ("line", "away")),  # vehicles of the other lane may leave from this one
         (("line", "beside"), None),
         (("out", "away"), None),
         (("line",), None),

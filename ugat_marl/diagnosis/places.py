@@ -985,7 +985,8 @@ def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str,
     """Find two consecutive detectors of one stream that both count too few.
 
     A single detector with too few vehicles contradicts its neighbours, so it is at fault. If the
-    next detector counts too few as well, the vehicles may have left the road.
+    next detector counts too few as well, the vehicles may have left the road. Those that leave it
+    change lanes before, so the stream is that of the whole road.
 
     Returns:
         Ids of the upstream and the downstream detector, or None.
@@ -996,17 +997,18 @@ def one_behind_the_other(members: Members, layout: DetectorLayout) -> tuple[str,
         if hypothesis.name == "undercount"
     ]
     known = layout.by_id
-    lanes = {lane.id: lane for lane in layout.lanes}
+    order = ("exit", "advance", "stop")
+    following: defaultdict[str, set[str]] = defaultdict(set)
+    for lane in layout.lanes:
+        following[lane.edge] |= lane.following
     suspects = [known[str(name)] for name in short if name in known]
     for one in suspects:
         for other in suspects:
-            lane, edge = lanes.get(one.lane), edge_of_lane(other.lane)
-            on_one_edge = edge == edge_of_lane(one.lane)
+            edge, next_edge = edge_of_lane(one.lane), edge_of_lane(other.lane)
             if other.kind == "exit":
-                behind = one.kind != "exit" and lane is not None and edge in lane.following
+                behind = one.kind != "exit" and next_edge in following[edge]
             else:
-                order = ("exit", "advance", "stop")
-                behind = on_one_edge and order.index(one.kind) < order.index(other.kind)
+                behind = edge == next_edge and order.index(one.kind) < order.index(other.kind)
             if behind:
                 return one.id, other.id
     return None

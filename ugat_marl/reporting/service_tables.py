@@ -13,7 +13,7 @@ from ugat_marl.experiments import Evaluation
 from ugat_marl.reporting.formats import fixed, number_text
 from ugat_marl.reporting.light_names import LIGHT_HEADING, LightNames
 from ugat_marl.reporting.page import Grid
-from ugat_marl.reporting.terminal import MOST_NAME, in_tables, named_table
+from ugat_marl.reporting.terminal import in_tables, named_table
 from ugat_marl.scenarios import Network, named_approaches
 
 MOST_APPROACHES = 8
@@ -117,8 +117,7 @@ def control_delay_table(
         table.add_column("veh", justify="right")
         for controller in part:
             lines = controller.replace(":", ":\n", 1)
-            least = min(max(map(len, lines.split())), MOST_NAME)
-            table.add_column(lines, justify="right", overflow="fold", min_width=least)
+            table.add_column(lines, justify="right", overflow="fold")
         for road in shown:
             named = names.get(road)
             light, approach = (lights.text(named.light), named.name) if named else ("", "")

@@ -13,7 +13,7 @@ from rich.text import Text
 _MOST_WORD = 24
 """Longest word that is kept whole in a table that is too wide, in characters."""
 
-MOST_NAME = 22
+_MOST_NAME = 22
 """Widest column of names, in characters: three of them leave numbers a place in 80 columns."""
 
 
@@ -85,5 +85,5 @@ def named_table(title: str, *headings: str) -> Table:
     """Return a titled table that begins with columns of names, which may be broken anywhere."""
     table = titled_table(title)
     for heading in headings:
-        table.add_column(heading, max_width=MOST_NAME, overflow="fold")
+        table.add_column(heading, max_width=_MOST_NAME, overflow="fold")
     return table
