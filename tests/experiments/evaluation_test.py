@@ -19,7 +19,7 @@ from ugat_marl.envs import parallel_env
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
 from ugat_marl.experiments import Evaluation, best_rule, evaluation_of, policy_factory, rule_factory
 from ugat_marl.experiments.evaluation import Result, TrainedPolicy
-from ugat_marl.policies import DQN, DQNConfig, export_policy
+from ugat_marl.policies import DQN, DQNConfig, NamedRule, export_policy
 from ugat_marl.simulation import host
 
 BASE = Scores(100.0, 90.0, 500.0, -3.0, 3.0, 0.4, 50.0, 520.0, 515.0, 5.0)
@@ -133,6 +133,22 @@ def test_a_wrong_name_is_refused_before_anything_runs() -> None:
         evaluation_of(scenario, {"r": rule_factory("random")}, ["sim", "V44"], [1])
     with pytest.raises(UnknownNameError, match="largest-queue"):
         policy_factory("largest-que:20")
+
+
+def test_a_rule_is_the_rule_whatever_files_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("max-pressure").mkdir()
+    assert policy_factory("max-pressure") == rule_factory("max-pressure")
+    with pytest.raises(CheckpointError, match="is a folder"):
+        policy_factory("./max-pressure")
+
+
+def test_a_rule_that_a_training_with_a_learner_of_ones_own_kept(tmp_path: Path) -> None:
+    NamedRule("largest-queue:20", parallel_env("single-v1")).save(tmp_path / "fitted-street.pt")
+    kept = policy_factory(f"my_algo:MyLearner@{tmp_path}/fitted-street.pt")
+    assert kept == rule_factory("largest-queue:20")
 
 
 def test_a_file_of_python_is_given_with_the_name_in_it(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from ugat_marl.data import write_csv
 from ugat_marl.errors import CheckpointError, OptionError, OutputError
 from ugat_marl.experiments import ranked, read_standings, require_kept, with_standings
 from ugat_marl.experiments.standings import SCHEMA, Judging, judged_in
+from ugat_marl.policies import shipped
 
 HEAD = ",".join(SCHEMA)
 TABLE = f"""{HEAD}
@@ -170,6 +171,22 @@ def test_a_file_by_two_paths_is_one_training(
     words = ["compare", "single-v1", "--name", "mine", "--policies", "own.pt", other]
     assert main(words) == 2
     assert "it would count as two trainings" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("max-pressure", "max-pressure:10"),
+        ("single-v1/direct-transfer-s0", "single-v1/./direct-transfer-s0.pt"),
+    ],
+)
+def test_one_policy_in_two_spellings_is_one_training(
+    one: str, other: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(shipped.FOLDER)
+    assert main(["compare", "single-v1", "--name", "mine", "--policies", one, other]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"--policies has {other} twice as {one} and {other}: it would count as two" in said
 
 
 def test_every_committed_table_can_be_read() -> None:

@@ -187,6 +187,13 @@ class MakesItselfAnew(Good):
         return cls()
 
 
+@breaks("saving_keeps_its_answers")
+class IsMadeAnew(Good):
+    @staticmethod
+    def load(path):
+        return IsMadeAnew()
+
+
 @pytest.mark.parametrize(
     ("check", "subject"),
     BROKEN,

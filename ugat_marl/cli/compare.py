@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -35,6 +36,26 @@ from ugat_marl.parallel import Workers
 from ugat_marl.progress import Bars, Reporter
 from ugat_marl.reporting import standings_table
 from ugat_marl.scenarios import Scenario
+
+
+def _refuse_twice(policies: Sequence[str]) -> None:
+    """Refuse a policy that is given twice, in whatever spelling.
+
+    Raises:
+        OptionError: It is.
+    """
+    from ugat_marl.policies import RULES, parse_rule, shipped_policies
+
+    known: dict[object, str] = {}
+    for name in policies:
+        path = shipped_policies().get(name, Path(name))
+        one = parse_rule(name) if name.partition(":")[0] in RULES else path.resolve()
+        if one in known:
+            other = f" as {known[one]} and {name}" if known[one] != name else ""
+            raise OptionError(
+                f"--policies has {name} twice{other}: it would count as two trainings"
+            )
+        known[one] = name
 
 
 @dataclass(frozen=True)
@@ -108,9 +129,7 @@ class Compare:
             raise OptionError(f"--name {self.name!r}: give the new row a name")
         if bool(self.policies) == (self.learner is not None):
             raise OptionError("compare needs --policies or --learner, one of the two")
-        files = [Path(each).resolve() if Path(each).is_file() else each for each in self.policies]
-        if twice := [each for each in files if files.count(each) > 1]:
-            raise OptionError(f"--policies has {twice[0]} twice: it would count as two trainings")
+        _refuse_twice(self.policies)
         if self.policies:
             refuse_options(
                 self,

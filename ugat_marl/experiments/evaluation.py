@@ -303,25 +303,27 @@ def policy_factory(spec: str) -> PolicyFactory:
         CheckpointError: The file is not a policy. The factory raises it for a policy of another
             scenario.
     """
+    if spec.partition(":")[0] in RULES:  # also beside a file of this name, which is ./NAME
+        return rule_factory(spec)
+    from ugat_marl.policies import load_policy, rule_in  # torch, which rules do without
+
     name, at, file = spec.partition("@")
-    if is_own(name) and name.partition(":")[0] not in RULES:
+    path = Path(file if at and is_own(name) else spec)
+    if path.is_file() and (rule := rule_in(path)) is not None:  # a fitted street may keep a rule
+        return rule_factory(rule)
+    if is_own(name):
         if at:
-            return OwnLearnerPolicy(name, Path(file))
+            return OwnLearnerPolicy(name, path)
         load_own(name, "policy")  # a wrong name is an error now
         place, _, found = name.rpartition(":")
         file = place.endswith(".py")
         return NamedPolicy(f"{with_home(place).resolve()}:{found}" if file else name)
-    path = Path(spec)
     if path.is_dir():
         raise CheckpointError(f"{path} is a folder; name the .pt file of a policy in it")
     if path.suffix == ".py" and path.is_file():
         raise OptionError(f"policy {spec!r}: give the name in it, {spec}:NAME")
     if path.suffix != ".pt" and not path.is_file() and "/" not in spec:
-        return rule_factory(spec)
-    from ugat_marl.policies import load_policy, rule_in  # torch, which rules do without
-
-    if (rule := rule_in(path)) is not None:  # a fitted street may keep a rule
-        return rule_factory(rule)
+        return rule_factory(spec)  # an error that names those there are
     return TrainedPolicy(load_policy(spec), spec)
 
 

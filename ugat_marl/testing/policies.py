@@ -244,12 +244,10 @@ def saving_keeps_its_answers(case: PolicyCase) -> None:
 
 
 def _loaded(policy: Any, path: Path) -> Any:
-    """Return a policy of a file; `load` is a class method, or fills the policy it belongs to."""
-    if isinstance(getattr(policy.load, "__self__", None), type):
-        return type(policy).load(path)
-    loaded = copy.deepcopy(policy)
-    loaded.load(path)
-    return loaded
+    """Return a policy of a file; `load` returns it, or fills the policy it belongs to."""
+    filled = copy.deepcopy(policy)
+    made = filled.load(path)
+    return made if callable(getattr(made, "act", None)) else filled
 
 
 POLICY_CHECKS = (
