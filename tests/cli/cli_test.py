@@ -290,7 +290,7 @@ def test_a_recorded_log_trains(
     assert TransitionLog.read(log).provenance.domain == "V4"
     call = ["train", "single-v1", "--real", "none", "--real-log", str(log), "--out"]
     call += [str(tmp_path / "run"), "--pretrain-episodes", "1", "--iterations", "1"]
-    call += ["--grounded-episodes", "1", "--fit.epochs", "1", "--tuning-seeds", "1"]
+    call += ["--grounded-episodes", "1", "--tuning-seeds", "1"]
     call += ["--dqn.teacher", "None", "--street.simulations", "20", "--street.judged", "1"]
     assert main([*call, "--evaluation-seeds", "1", "--no-control", *short]) == 0
     assert "direct transfer" in capsys.readouterr().out

@@ -16,12 +16,25 @@ from tests.runs import search_few_rules
 from ugat_marl.data import Scores
 from ugat_marl.effects import Headway
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, PaperConfig, TransferConfig, run_folder
+from ugat_marl.experiments import Evaluation, PaperConfig, TransferConfig, compare, run_folder
 from ugat_marl.experiments.functions import _texts
 from ugat_marl.experiments.scores import Result as Episode
-from ugat_marl.grounding import GateConfig, TimedConfig, UgatConfig
+from ugat_marl.grounding import (
+    FitConfig,
+    GateConfig,
+    InputsConfig,
+    ResidualConfig,
+    StreetConfig,
+    TimedConfig,
+    UgatConfig,
+    as_published,
+    refuse_unused,
+)
 from ugat_marl.policies import DQNConfig, learner_factory
+from ugat_marl.progress import Silent
 from ugat_marl.testing import ToyTraffic
+
+RESIDUAL = StreetConfig(residual=ResidualConfig("phase"))
 
 
 def scored(att_s: float) -> Scores:
@@ -90,14 +103,36 @@ def test_one_domain_may_be_a_text() -> None:
     assert frame["domain"].to_list() == ["headway=1.4"]
 
 
-def test_settings_of_another_grounding_are_refused_in_a_new_run() -> None:
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        (UgatConfig("phase", timed=TimedConfig(most_s=3)), r"settings timed\.\* count with"),
+        (
+            UgatConfig("phase", street=StreetConfig(simulations=40)),
+            r"street\.\* .*grounding street",
+        ),
+        (UgatConfig("street", fit=FitConfig(epochs=3)), r"fit\.\* count .*phase or timed, or"),
+        (UgatConfig("street", inputs=InputsConfig(history=2)), r"settings inputs\.\* count"),
+        (UgatConfig("street", sim_rollouts=5), "setting sim_rollouts counts .* phase or timed;"),
+        (UgatConfig("street", least_accuracy=0.5), "setting least_accuracy counts"),
+        (UgatConfig("timed", timed=TimedConfig(most_s=3), gate=GateConfig("static")), None),
+        (UgatConfig("street", street=RESIDUAL, fit=FitConfig(epochs=3), least_accuracy=0.5), None),
+        (as_published(UgatConfig()), None),
+    ],
+)
+def test_settings_of_another_grounding_are_refused(config: UgatConfig, says: str | None) -> None:
+    if says is None:
+        refuse_unused(config, config.used)
+    else:
+        with pytest.raises(OptionError, match=says):
+            refuse_unused(config, config.used)
+
+
+def test_a_table_refuses_settings_that_none_of_its_rows_uses(tmp_path: Path) -> None:
     """An older run that has some can be resumed, so they make a configuration."""
-    config = TransferConfig("single-v1", ugat=UgatConfig("phase", timed=TimedConfig(most_s=3)))
-    with pytest.raises(OptionError, match=r"settings timed\.\* count with the grounding timed"):
-        config.refuse_settings_of_other_groundings()
-    timed = UgatConfig("timed", timed=TimedConfig(most_s=3), gate=GateConfig("static"))
-    TransferConfig("single-v1", ugat=timed).refuse_settings_of_other_groundings()
-    TransferConfig("single-v1", preset="paper").refuse_settings_of_other_groundings()
+    config = PaperConfig(rows=("fitted street",), fit=FitConfig(epochs=3))
+    with pytest.raises(OptionError, match=r"settings fit\.\* count with the grounding phase"):
+        compare("main", "single-v1", config, tmp_path, 1, Silent())
 
 
 def test_wrong_calls_are_refused() -> None:

@@ -22,7 +22,14 @@ from ugat_marl.data.runs import IDENTITY_FILE
 from ugat_marl.effects import load_scenario
 from ugat_marl.envs import TrafficEnv, parallel_env
 from ugat_marl.errors import CheckpointError, LogError, OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, Setting, run_folder, transfer, transfers
+from ugat_marl.experiments import (
+    Evaluation,
+    PaperConfig,
+    Setting,
+    run_folder,
+    transfer,
+    transfers,
+)
 from ugat_marl.experiments.jobs import LEARNER, file_names, perform
 from ugat_marl.experiments.randomised import RandomisedEnv
 from ugat_marl.experiments.row_names import DIRECT, FINE_TUNED
@@ -272,8 +279,9 @@ def test_what_makes_no_sense_is_refused(options: dict[str, Any], complaint: str)
 
 
 def test_a_domain_under_another_name_is_the_same_run() -> None:
-    aliases = replace(SMALL, real="Snow", sim=" SIM ", further=("rain",))
-    assert aliases == replace(SMALL, real="V4", sim="sim", further=("V3",))
+    aliases = replace(SMALL, real="Snow", sim=" SIM ", further=("rain",), corrected="rain")
+    assert aliases == replace(SMALL, real="V4", sim="sim", further=("V3",), corrected="V3")
+    assert PaperConfig(sim="snow", domains=("V1",)) == PaperConfig(sim="V4", domains=("V1",))
     assert run_folder(aliases).name == "single-v1-V4-s0"
 
 
@@ -369,7 +377,7 @@ def test_names_of_policies_are_names_of_files_of_their_own() -> None:
 def test_a_queue_model_that_shows_no_crossings_is_refused_at_once(
     grounding: Literal["timed", "street"], tmp_path: Path
 ) -> None:
-    config = replace(SMALL, sim="meso", ugat=replace(SMALL.ugat, grounding=grounding))
+    config = replace(SMALL, sim="meso", ugat=UgatConfig(grounding))
     with pytest.raises(OptionError, match="use the grounding phase, or no iterations"):
         transfer(config, tmp_path / "run")
     assert not (tmp_path / "run" / "trainings").exists()
@@ -388,9 +396,8 @@ def test_a_directory_is_judged_at_the_length_that_is_played(
         )
     monkeypatch.setattr(transfers, "perform_here", lambda *_, **_options: [])
     monkeypatch.setattr(transfers, "_write_results", lambda *_: "table")
-    street = replace(SMALL.ugat, grounding="street")
     domain = {"sim": "sim", "real": "V4", place: str(directory)}
-    transfer(replace(SMALL, **domain, ugat=street), tmp_path / "run")
+    transfer(replace(SMALL, **domain, ugat=UgatConfig("street")), tmp_path / "run")
     hashes = json.loads((tmp_path / "run" / IDENTITY_FILE).read_text())["scenario_hash"]
     played = parallel_env(SMALL.scenario, str(directory), duration_s=SMALL.duration_s)
     assert hashes[place] == played.scenario.hash

@@ -178,8 +178,8 @@ def test_a_killed_process_resumes(
     folder = tmp_path / "run"
     command = [
         "train", "single-v1", "--duration-s", "60", "--out", str(folder), "--pretrain-episodes",
-        "11", "--iterations", "1", "--grounded-episodes", "1", "--sim-rollouts", "2",
-        "--real-rollouts", "2", "--fit.epochs", "2", "--no-control", "--evaluation-seeds", "1",
+        "11", "--iterations", "1", "--grounded-episodes", "1",
+        "--real-rollouts", "2", "--no-control", "--evaluation-seeds", "1",
         "--tuning-seeds", "1", "--learner", "dqn", "--street.simulations", "20",
         "--street.judged", "1",
     ]  # fmt: skip

@@ -19,6 +19,7 @@ import pytest
 from tests.docs.commands_test import COMMAND_LINES, words_of
 from ugat_marl.__main__ import COMMANDS
 from ugat_marl.cli.help import options_of
+from ugat_marl.grounding.config import GROUNDINGS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -72,6 +73,25 @@ ALGORITHM = re.findall(r"```python\n(class MyLearner.*?)```", LEARNERS, flags=re
 """The user's module, as the page has it."""
 
 
+COUNT_WITH = {
+    "--sim-rollouts": ("phase", "timed"),
+    "--fit.epochs": ("phase", "timed"),
+    "--street.simulations": ("street",),
+    "--street.judged": ("street",),
+}
+"""Groundings with which some of these budgets count."""
+
+
+def groundings_of(name: str, words: list[str]) -> set[str]:
+    """Groundings of a command: those that it names, or its usual ones."""
+    if "--preset" in words or name in ("paper ablation", "paper alpha", "paper uncertainty"):
+        return {"phase"}
+    if name == "train":
+        return {words[words.index("--grounding") + 1] if "--grounding" in words else "street"}
+    chosen = "--groundings" in words or "--rows" in words
+    return {one for one in GROUNDINGS if not chosen or one in " ".join(words)}
+
+
 def cases() -> list[Any]:
     """Commands that run here."""
     return [
@@ -95,6 +115,8 @@ def small(command: str) -> list[str]:
             continue
         if "--video" in words and option == "--duration-s":
             continue  # a film begins after some minutes
+        if option in COUNT_WITH and groundings_of(name, words).isdisjoint(COUNT_WITH[option]):
+            continue  # it is refused where it would do nothing
         if "--preset" in words and "." in option:
             continue  # the preset decides
         if given is None and (name.startswith(("scenario", "plan")) and option == "--duration-s"):

@@ -50,6 +50,7 @@ from ugat_marl.grounding import (
     UgatConfig,
     as_published,
     published_reward,
+    refuse_unused,
     require_preset,
 )
 from ugat_marl.parallel import Workers
@@ -390,6 +391,7 @@ class PaperConfig:
             self._take_published()
         if not self.learner:
             object.__setattr__(self, "learner", UNIVERSAL_NAME)
+        object.__setattr__(self, "sim", domain_label(self.sim))  # V4 and snow are one simulation
         require_least(0, first_seed=self.first_seed)
         require_least(1, seeds=self.seeds, evaluation_seeds=self.evaluation_seeds)
         require_least(1, episodes=self.episodes)
@@ -398,7 +400,7 @@ class PaperConfig:
         if not self.scenario:
             raise OptionError("scenario is empty; name one, such as single-v1")
         require_distinct_domains(self.domains)
-        if domain_label(self.sim) in map(domain_label, self.domains):
+        if self.sim in map(domain_label, self.domains):
             raise OptionError(f"domain {self.sim!r} is the simulation itself; name real ones")
         if self.timed.match:
             raise OptionError("rewards are matched in a row of its own; leave timed.match out")
@@ -463,7 +465,7 @@ class PaperConfig:
         """Return the real domains of a table."""
         default = ("V1",) if table in ("ablation", "alpha") else ("V1", "V2", "V3", "V4")
         domains = [domain_label(domain) for domain in self.domains or default]
-        if left := [domain for domain in domains if domain != domain_label(self.sim)]:
+        if left := [domain for domain in domains if domain != self.sim]:
             return left
         raise OptionError(
             f"every domain of table {table!r} is the simulation itself (sim = {self.sim!r}); "
@@ -511,6 +513,7 @@ def compare(
     """
     loaded = load_scenario(scenario, config.duration_s)
     rows = config.settings(table)
+    refuse_unused(config.ugat, {name for row in rows if row.ugat for name in row.ugat.used})
     config.spec.factory(config.device)  # a missing library is an error now, not in a job's log
     for target in config.targets(table):
         # an error now, not in an hour
@@ -527,7 +530,7 @@ def compare(
     return Comparison(
         loaded.id,
         loaded.hash,
-        domain_label(config.sim),
+        config.sim,
         tuple(trials),
         {"learner": config.learner},
         constants=tuple(row.name for row in rows if row.name in late),

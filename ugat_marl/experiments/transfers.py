@@ -70,6 +70,7 @@ from ugat_marl.grounding import (
     UgatConfig,
     as_published,
     published_reward,
+    refuse_unused,
     require_negative_control,
     require_preset,
 )
@@ -183,6 +184,8 @@ class TransferConfig:
         for name in ("real", "sim"):  # V4 and snow are one run
             object.__setattr__(self, name, domain_label(getattr(self, name)))
         object.__setattr__(self, "further", tuple(map(domain_label, self.further)))
+        if self.corrected is not None:
+            object.__setattr__(self, "corrected", domain_label(self.corrected))
         require_least(0, seed=self.seed)
         require_least(1, evaluation_seeds=self.evaluation_seeds, tuning_seeds=self.tuning_seeds)
         require_least(LEAST_BUDGET, rule_budget=self.rule_budget)
@@ -197,7 +200,7 @@ class TransferConfig:
                 f"further = {self.sim} is what the control does ({CONTROL!r}); use the control "
                 "for it, and leave it out of further"
             )
-        if self.corrected is not None and domain_label(self.corrected) == self.sim:
+        if self.corrected is not None and self.corrected == self.sim:
             raise OptionError(
                 f"corrected = {self.corrected!r} is the simulation itself; name the scenario that "
                 "`ugat-marl diagnose` wrote, or another domain"
@@ -207,27 +210,6 @@ class TransferConfig:
                 'real = "none" needs real_log, a log of the street; or name a real domain'
             )
         self._refuse_impossible_controls()
-
-    def refuse_settings_of_other_groundings(self) -> None:
-        """Refuse settings that would do nothing; an older run that has some can be resumed.
-
-        Raises:
-            OptionError: A part of `ugat` differs from its defaults and is not used.
-        """
-        usual, kind, residual = UgatConfig(), self.ugat.grounding, self.ugat.street.residual.kind
-        acting = residual if kind == "street" else kind  # what changes actions, if anything does
-        unused = {
-            "none": ("forward", "inverse", "gate", "timed"),
-            "phase": ("timed",),
-        }.get(acting, ())
-        for part in unused:
-            if getattr(self.ugat, part) != getattr(usual, part):
-                others = "timed" if part == "timed" else "phase or timed"
-                raise OptionError(
-                    f"settings {part}.* count with the grounding {others}, or with such a residual "
-                    f"of a fitted street, and this is {kind}; leave them out, or ask for another "
-                    "grounding"
-                )
 
     def _refuse_impossible_controls(self) -> None:
         _ = self.spec  # raises an error for an unknown learner, or settings of another one
@@ -339,8 +321,8 @@ def transfer(
         CheckpointError: The folder holds a run with other options.
     """
     reporter = reporter or Silent()
-    if not resume:
-        config.refuse_settings_of_other_groundings()
+    if not resume:  # an older run that has such settings goes on
+        refuse_unused(config.ugat, config.ugat.used)
     scenario = load_scenario(config.scenario, config.duration_s)
     with contextlib.closing(parallel_env(scenario, config.sim, **config.env_options)) as env:
         _check(config, scenario, env, reporter)  # an error now, not in an hour
@@ -507,7 +489,7 @@ def _notes(config: TransferConfig, rules: Mapping[str, str]) -> dict[str, str]:
         "rules searched": searched,
         "training seed": str(config.seed),
         "learner": config.learner,
-        **({} if config.corrected is None else {CORRECTED: domain_label(config.corrected)}),
+        **({} if config.corrected is None else {CORRECTED: config.corrected}),
     }
 
 
@@ -538,10 +520,10 @@ def _check(config: TransferConfig, scenario: Scenario, env: TrafficEnv, reporter
 
 def _say_if_from_elsewhere(log: TransitionLog, config: TransferConfig, reporter: Reporter) -> None:
     recorded = log.provenance.domain
-    if config.real != "none" and recorded != domain_label(config.real):
+    if config.real != "none" and recorded != config.real:
         reporter.say(
             f"note: the real log was recorded in {recorded!r}, the policies are judged in "
-            f"{domain_label(config.real)!r}"
+            f"{config.real!r}"
         )
 
 

@@ -9,6 +9,7 @@ from .config import USUAL_REWARD as USUAL_REWARD
 from .config import UgatConfig as UgatConfig
 from .config import as_published as as_published
 from .config import published_reward as published_reward
+from .config import refuse_unused as refuse_unused
 from .config import require_preset as require_preset
 from .controls import NegativeControl as NegativeControl
 from .controls import ShuffledWorld as ShuffledWorld

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
@@ -66,6 +66,14 @@ class UgatConfig:
     gate: GateConfig = field(default_factory=GateConfig)
     timed: TimedConfig = field(default_factory=TimedConfig)
     street: StreetConfig = field(default_factory=StreetConfig)
+
+    @property
+    def used(self) -> frozenset[str]:
+        """Names of the settings among `WITH` that this grounding, or its residual, uses."""
+        fitted = self.grounding == "street"
+        acting = self.street.residual.kind if fitted else self.grounding
+        models = frozenset() if acting == "none" else _OF_MODELS
+        return models | {acting} & {"timed"} | {"street" if fitted else "sim_rollouts"}
 
     @property
     def most_delay_s(self) -> int:
@@ -160,6 +168,38 @@ class UgatConfig:
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:
                 raise OptionError(f"{name} = {value}: must be from 0 to 1")
+
+
+_OF_MODELS = frozenset(("least_accuracy", "inputs", "forward", "inverse", "fit", "gate"))
+_RESIDUAL = ", or with such a residual of a fitted street"
+WITH: Mapping[str, str] = {
+    **dict.fromkeys(sorted(_OF_MODELS), f"phase or timed{_RESIDUAL}"),
+    "timed": f"timed{_RESIDUAL}",
+    "sim_rollouts": "phase or timed",
+    "street": "street",
+}
+"""Settings that some groundings do not use, and with which they count."""
+
+
+def refuse_unused(config: UgatConfig, used: Collection[str]) -> None:
+    """Refuse settings that would do nothing.
+
+    Args:
+        config: The settings.
+        used: Names of those among `WITH` that are used.
+
+    Raises:
+        OptionError: One that is not used differs from its default.
+    """
+    usual = UgatConfig()
+    for name, groundings in WITH.items():
+        if name not in used and getattr(config, name) != getattr(usual, name):
+            single = isinstance(getattr(usual, name), float | int)
+            what = f"setting {name} counts" if single else f"settings {name}.* count"
+            raise OptionError(
+                f"{what} with the grounding {groundings}; leave it out, or "
+                "ask for another grounding"
+            )
 
 
 COUNTS: Mapping[str, int] = {
