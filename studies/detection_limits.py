@@ -11,7 +11,6 @@ should contradict the scenario.
 from __future__ import annotations
 
 import argparse
-import itertools
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -21,6 +20,7 @@ from pathlib import Path
 from rich.console import Console
 from scipy.stats import binomtest
 
+from studies.errors import MeasurementError
 from ugat_marl.cli import guarded
 from ugat_marl.data import MeasuredData
 from ugat_marl.diagnosis import DetectionLimit, DiagnosisConfig, Study, diagnose, locate_gap
@@ -64,6 +64,9 @@ def domains_at(limits: Sequence[DetectionLimit]) -> list[tuple[str, str]]:
     return domains
 
 
+_MOST_DRAWS = 20
+
+
 @dataclass(frozen=True)
 class Streets:
     """Streets of one scenario, measured under one policy.
@@ -86,16 +89,22 @@ class Streets:
         """Return the limits for data of the scenario as it is.
 
         One data set in twenty contradicts it by chance and has no limits; then another is drawn.
+
+        Raises:
+            MeasurementError: Several in a row contradict it, which is no chance.
         """
         config = DiagnosisConfig(limits=True, cache=self.cache)
-        for number in itertools.count():
+        for number in range(_MOST_DRAWS):
             measured = self._measured("sim", derive_seed(self.seed, "limits", number))
             with tempfile.TemporaryDirectory(prefix="ugat_marl-limits-") as folder:
                 found = diagnose(self.scenario, measured, folder, config, reporter)
             if found.verdict == "no_discrepancy":
                 return found.limits
             reporter.say(f"note: data set {number + 1} is called {found.verdict}")
-        raise AssertionError("endless")
+        raise MeasurementError(
+            f"{self.scenario.id}: {_MOST_DRAWS} data sets of the scenario as it is contradict it; "
+            "ask for more periods"
+        )
 
     def _measured(self, domain: str, seed: int) -> MeasuredData:
         policy = policy_factory(self.policy)

@@ -120,7 +120,7 @@ def test_a_wrong_call_is_one_line_with_the_nearest_name(
     assert says in complaint(capsys, *arguments)
 
 
-@pytest.mark.parametrize("value", ["99:30", "-7:05", "7:75", "1:2:3:04"])
+@pytest.mark.parametrize("value", ["24:30", "-7:05", "7:75", "1:2:3:04"])
 def test_what_is_no_time_of_day_is_not_translated(
     value: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

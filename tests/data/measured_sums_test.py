@@ -150,6 +150,9 @@ def test_a_column_of_zeros_was_not_measured(
     whole.with_columns(pl.lit(0.0).alias(column)).write_csv(path)
     with pytest.raises(MeasuredDataError, match=f"{column} '0.0' is 0 wherever vehicles were"):
         read_measured(written, scenario, network)
+    quiet = whole.with_columns(pl.lit(0.0).alias("occupancy"), count=1)
+    quiet.write_csv(path)  # a vehicle in five minutes occupies no whole percent of them
+    read_measured(written, scenario, network)
     number = pl.int_range(pl.len())
     few = pl.when(number % 2 == 0).then(0.0).otherwise(column)
     whole.with_columns(few.alias(column)).write_csv(path)

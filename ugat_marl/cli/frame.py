@@ -59,7 +59,7 @@ _PLAIN_WORDS = {
     r"^Error parsing [\w.]+: *": "",
 }
 """Messages of tyro to what they mean."""
-_CLOCK = re.compile(r"(?<![-\d:])([01]?\d|2[0-4]):([0-5]\d)(?::([0-5]\d))?'?: not a number")
+_CLOCK = re.compile(r"(?<![-\d:])([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d))?'?: not a number")
 _LONGEST_MESSAGE = 1500
 """Most characters of an error: about twenty lines of a terminal."""
 _WAYS_OUT = {

@@ -29,6 +29,10 @@ SATURATED_PER_S = 0.65
 """Vehicles per second and lane that no lane serves for a minute or more (2,340 per hour)."""
 LONG_S = 60.0
 """Shortest interval in which a lane cannot serve more than that."""
+_LEAST_S = 0.2
+"""Least time of a vehicle over a detector, s: 4 m at 20 m/s."""
+_ROUNDED = 0.005
+"""Share of time below which an occupancy in whole percents is 0."""
 
 
 def counts_of(
@@ -205,8 +209,9 @@ def _refuse_units(path: Path, frame: pl.DataFrame) -> None:
         ),
     ):
         refuse(path, frame.filter(bad), column, complaint, way_out)
-    for column in ("occupancy", "mean_speed_mps"):
-        seen = frame.filter(pl.col("count") > 0, pl.col(column).is_not_null())
+    occupied = pl.col("count") * _LEAST_S / (pl.col("end_s") - pl.col("begin_s"))
+    for column, shows in (("occupancy", occupied >= _ROUNDED), ("mean_speed_mps", pl.lit(True))):
+        seen = frame.filter(pl.col("count") > 0, pl.col(column).is_not_null(), shows)
         if seen["count"].sum() >= FEWEST and not (seen[column] != 0).any():
             way_out = "leave the cells empty if it was not measured"
             refuse(path, seen, column, "is 0 wherever vehicles were counted", way_out)

@@ -138,7 +138,7 @@ def _walk(
         entry: First road.
         shares: Share of each turn.
         random: Source of the draws.
-        again: True if it may pass a junction twice, and only no road.
+        again: True if it may pass a junction twice, but no road.
     """
 
     def place(road: str) -> str:
