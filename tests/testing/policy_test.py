@@ -194,6 +194,13 @@ class IsMadeAnew(Good):
         return IsMadeAnew()
 
 
+@breaks("saving_keeps_its_answers")
+class ReturnsNoPolicy(Good):
+    @classmethod
+    def load(cls, path):
+        np.load(path.with_suffix(".npy"))
+
+
 @pytest.mark.parametrize(
     ("check", "subject"),
     BROKEN,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -247,7 +248,14 @@ def _loaded(policy: Any, path: Path) -> Any:
     """Return a policy of a file; `load` returns it, or fills the policy it belongs to."""
     filled = copy.deepcopy(policy)
     made = filled.load(path)
-    return made if callable(getattr(made, "act", None)) else filled
+    if callable(getattr(made, "act", None)):
+        return made
+    load = inspect.getattr_static(policy, "load", None)  # None where __getattr__ makes it
+    require(
+        not isinstance(load, classmethod | staticmethod),
+        f"load(path) returned {type(made).__name__}; return the policy that it read",
+    )
+    return filled
 
 
 POLICY_CHECKS = (
