@@ -85,7 +85,7 @@ class Comparison:
 
     def seeds_of(self, setting: str, target: str) -> list[int]:
         """Return the seeds of a setting's trainings, ascending; all seeds for a rule."""
-        return sorted(seed for seed in self._by_seed(setting, target, "att_s") if seed is not None)
+        return [seed for seed in self._by_seed(setting, target, "att_s") if seed is not None]
 
     def has(self, setting: str, target: str) -> bool:
         """Return True if there are trials of the setting for that domain."""
@@ -111,17 +111,16 @@ class Comparison:
             measure: A field of `Scores`.
             domain: Domain of the episodes; default: the target.
         """
-        means = self._by_seed(setting, target, measure, domain)
-        return np.array([means[seed] for seed in sorted(means, key=lambda s: s or 0)])
+        return np.array(list(self._by_seed(setting, target, measure, domain).values()))
 
     def _by_seed(
         self, setting: str, target: str, measure: str, domain: str | None = None
     ) -> Mapping[int | None, float]:
-        """Return means over the episodes by training seed, as `values` does."""
+        """Return means over the episodes by training seed, ascending, as `values` does."""
         played = self._scores.get((setting, target, target if domain is None else domain), {})
         means = {
             seed: float(np.mean([getattr(scores, measure) for scores in played[seed]]))
-            for seed in played
+            for seed in sorted(played, key=lambda s: s or 0)
         }
         if None not in means:
             return means
@@ -130,7 +129,7 @@ class Comparison:
     def _paired(self, one: str, other: str, target: str) -> tuple[Floats, Floats]:
         """Return the ATT of two settings for the training seeds that both have, in s, ``(n,)``."""
         first, second = (self._by_seed(name, target, "att_s") for name in (one, other))
-        both = sorted(first.keys() & second.keys(), key=lambda s: s or 0)
+        both = [seed for seed in first if seed in second]
         return np.array([first[s] for s in both]), np.array([second[s] for s in both])
 
     def episodes(self, setting: str, target: str) -> list[Scores]:
