@@ -178,6 +178,7 @@ def test_a_file_by_two_paths_is_one_training(
     [
         ("max-pressure", "max-pressure:10"),
         ("single-v1/direct-transfer-s0", "single-v1/./direct-transfer-s0.pt"),
+        ("mine.py:Mine@kept.pt", "./mine.py:Mine@./kept.pt"),
     ],
 )
 def test_one_policy_in_two_spellings_is_one_training(

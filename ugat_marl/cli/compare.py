@@ -44,18 +44,27 @@ def _refuse_twice(policies: Sequence[str]) -> None:
     Raises:
         OptionError: It is.
     """
-    from ugat_marl.policies import RULES, parse_rule, shipped_policies
-
     known: dict[object, str] = {}
     for name in policies:
-        path = shipped_policies().get(name, Path(name))
-        one = parse_rule(name) if name.partition(":")[0] in RULES else path.resolve()
+        one = _without_spelling(name)
         if one in known:
             other = f" as {known[one]} and {name}" if known[one] != name else ""
             raise OptionError(
                 f"--policies has {name} twice{other}: it would count as two trainings"
             )
         known[one] = name
+
+
+def _without_spelling(name: str) -> object:
+    """Return what all spellings of a policy have in common: settings of a rule, or whole paths."""
+    from ugat_marl.policies import RULES, is_own, parse_rule, shipped_policies
+
+    if name.partition(":")[0] in RULES:
+        return parse_rule(name)
+    own, at, file = name.partition("@")
+    if at and is_own(own):
+        return Path(own).resolve(), Path(file).resolve()
+    return shipped_policies().get(name, Path(name)).resolve()
 
 
 @dataclass(frozen=True)
