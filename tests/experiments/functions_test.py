@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import polars as pl
@@ -16,7 +17,14 @@ from tests.runs import search_few_rules
 from ugat_marl.data import Scores
 from ugat_marl.effects import Headway
 from ugat_marl.errors import CheckpointError, OptionError, UnknownNameError
-from ugat_marl.experiments import Evaluation, PaperConfig, TransferConfig, compare, run_folder
+from ugat_marl.experiments import (
+    Evaluation,
+    PaperConfig,
+    TransferConfig,
+    compare,
+    paper,
+    run_folder,
+)
 from ugat_marl.experiments.functions import _texts
 from ugat_marl.experiments.scores import Result as Episode
 from ugat_marl.grounding import (
@@ -133,6 +141,16 @@ def test_a_table_refuses_settings_that_none_of_its_rows_uses(tmp_path: Path) -> 
     config = PaperConfig(rows=("fitted street",), fit=FitConfig(epochs=3))
     with pytest.raises(OptionError, match=r"settings fit\.\* count with the grounding phase"):
         compare("main", "single-v1", config, tmp_path, 1, Silent())
+
+
+@pytest.mark.parametrize(("table", "rows"), [("gap", ()), ("main", ("direct transfer",))])
+def test_what_a_preset_sets_is_not_refused_without_grounded_rows(
+    table: str, rows: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(paper, "perform_all", Mock(side_effect=InterruptedError))
+    config = PaperConfig(preset="paper", domains=("V4",), rows=rows)
+    with pytest.raises(InterruptedError):
+        compare(table, "single-v1", config, tmp_path, 1, Silent())
 
 
 def test_wrong_calls_are_refused() -> None:
