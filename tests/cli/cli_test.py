@@ -47,11 +47,11 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ),
         (
             ["train", "single-v1", "--gate.mode", "static", "--gate.static-alpha", "0.3"],
-            "settings gate.* count with the grounding phase or timed",
+            "error: --gate.mode static counts with the grounding phase or timed",
         ),
         (
             ["train", "single-v1", "--grounding", "phase", "--timed.most-s", "3"],
-            "settings timed.* count with the grounding timed",
+            "error: --timed.most-s 3 counts with the grounding timed",
         ),
         (["import-log"], "import-log needs SCENARIO, MEASURED and --out PATH; see"),
         (

@@ -114,15 +114,21 @@ def test_one_domain_may_be_a_text() -> None:
 @pytest.mark.parametrize(
     ("config", "says"),
     [
-        (UgatConfig("phase", timed=TimedConfig(most_s=3)), r"settings timed\.\* count with"),
+        (
+            UgatConfig("phase", timed=TimedConfig(most_s=3)),
+            "timed.most_s = 3 counts with the grounding timed",
+        ),
         (
             UgatConfig("phase", street=StreetConfig(simulations=40)),
-            r"street\.\* .*grounding street",
+            "street.simulations = 40 counts with the grounding street;",
         ),
-        (UgatConfig("street", fit=FitConfig(epochs=3)), r"fit\.\* count .*phase or timed, or"),
-        (UgatConfig("street", inputs=InputsConfig(history=2)), r"settings inputs\.\* count"),
-        (UgatConfig("street", sim_rollouts=5), "setting sim_rollouts counts .* phase or timed;"),
-        (UgatConfig("street", least_accuracy=0.5), "setting least_accuracy counts"),
+        (
+            UgatConfig("street", fit=FitConfig(epochs=3)),
+            "fit.epochs = 3 counts .*phase or timed, or",
+        ),
+        (UgatConfig("street", inputs=InputsConfig(history=2)), "inputs.history = 2 counts"),
+        (UgatConfig("street", sim_rollouts=5), "sim_rollouts = 5 counts .* phase or timed;"),
+        (UgatConfig("street", least_accuracy=0.5), "least_accuracy = 0.5 counts"),
         (UgatConfig("timed", timed=TimedConfig(most_s=3), gate=GateConfig("static")), None),
         (UgatConfig("street", street=RESIDUAL, fit=FitConfig(epochs=3), least_accuracy=0.5), None),
         (as_published(UgatConfig()), None),
@@ -139,7 +145,7 @@ def test_settings_of_another_grounding_are_refused(config: UgatConfig, says: str
 def test_a_table_refuses_settings_that_none_of_its_rows_uses(tmp_path: Path) -> None:
     """An older run that has some can be resumed, so they make a configuration."""
     config = PaperConfig(rows=("fitted street",), fit=FitConfig(epochs=3))
-    with pytest.raises(OptionError, match=r"settings fit\.\* count with the grounding phase"):
+    with pytest.raises(OptionError, match="fit.epochs = 3 counts with the grounding phase"):
         compare("main", "single-v1", config, tmp_path, 1, Silent())
 
 

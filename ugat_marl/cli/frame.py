@@ -209,7 +209,7 @@ def _as_typed(message: str, words: Sequence[str]) -> str:
         group, _, name = option.removeprefix("--").replace("-", "_").rpartition(".")
         if not option.startswith("--") or not name.isidentifier():
             continue
-        owner = rf"(?:{re.escape(group)} |\w+Config\.)?" if group else ""
+        owner = rf"(?:{re.escape(group)}[ .]|\w+Config\.)?" if group else ""
         for found in re.finditer(rf"\b{owner}{name} (?:=|is) ([^\s:;,]+)", message):
             if _same(found[1], value):
                 return message.replace(found[0], f"{option} {value}")

@@ -192,13 +192,12 @@ def refuse_unused(config: UgatConfig, used: Collection[str]) -> None:
         OptionError: One that is not used differs from its default.
     """
     usual = UgatConfig()
-    for name, groundings in WITH.items():
-        if name not in used and getattr(config, name) != getattr(usual, name):
-            single = isinstance(getattr(usual, name), float | int)
-            what = f"setting {name} counts" if single else f"settings {name}.* count"
+    for name, value, _ in _others(config, usual, usual):
+        part = name.partition(".")[0]
+        if part in WITH and part not in used:
             raise OptionError(
-                f"{what} with the grounding {groundings}; leave it out, or "
-                "ask for another grounding"
+                f"{name} = {value} counts with the grounding {WITH[part]}; leave it out, or ask "
+                "for another grounding"
             )
 
 
