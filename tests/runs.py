@@ -51,6 +51,9 @@ SMALL = TransferConfig(
 )
 """A run that takes a second or two."""
 
+FITTED = UgatConfig("street", pretrain_episodes=2, grounded_episodes=2)
+"""Settings of a run in a fitted street, as short as `SMALL`; `street` is each test's own."""
+
 
 def checkpoint_of(run: Path) -> Path:
     """The checkpoint of the run's grounded training."""

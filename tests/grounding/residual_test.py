@@ -21,7 +21,7 @@ from tests.grounding.timed_test import MOST_S, SHAPES
 from tests.grounding.timed_test import QUICK as FIT
 from tests.grounding.timed_test import street as queues
 from tests.interrupts import KillAt
-from tests.runs import SMALL, numbers, play_nothing, weights
+from tests.runs import FITTED, SMALL, numbers, play_nothing, weights
 from ugat_marl.data import TransitionLog
 from ugat_marl.envs import parallel_env
 from ugat_marl.errors import OptionError, UnknownNameError
@@ -377,7 +377,7 @@ def test_where_commands_are_late_no_action_is_grounded(
     play_nothing(monkeypatch)
     residual = ResidualConfig(kind="phase")
     street = replace(QUICK, parts=("channel",), residual=residual)
-    ugat = replace(SMALL.ugat, grounding="street", street=street, iterations=1)
+    ugat = replace(FITTED, street=street, iterations=1, fit=SMALL.ugat.fit, least_accuracy=None)
     config = replace(SMALL, real=LATE, duration_s=600, ugat=ugat)
     transfer(config, tmp_path, workers=1)
     logged = numbers(tmp_path)
@@ -395,7 +395,7 @@ def test_an_interrupted_training_ends_as_an_unbroken_one(
     residual = ResidualConfig(kind="timed", worlds=4, members=2, trust=TrustConfig(folds=2))
     street = replace(QUICK, parts=("eyes",), residual=residual)
     fit = replace(SMALL.ugat.fit, epochs=3)
-    ugat = replace(SMALL.ugat, grounding="street", street=street, iterations=2, fit=fit)
+    ugat = replace(FITTED, street=street, iterations=2, fit=fit, least_accuracy=None)
     config = replace(SMALL, real="V4", ugat=ugat)
     monkeypatch.setattr("ugat_marl.grounding.residual.compare", trusted_everywhere)
     transfer(config, tmp_path / "whole", workers=1)

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.interrupts import KillAt
-from tests.runs import SMALL, checkpoint_of, numbers, play_nothing, weights
+from tests.runs import FITTED, SMALL, checkpoint_of, numbers, play_nothing, weights
 from ugat_marl.data import TransitionLog
 from ugat_marl.effects import late_greens, load_scenario
 from ugat_marl.envs import parallel_env
@@ -36,7 +36,7 @@ QUICK = StreetConfig(
     simulations=20, further=4, simulated_s=100.0, judged=1, rule_budget=0, rival="matched"
 )
 CONFIG = replace(
-    SMALL, ugat=replace(SMALL.ugat, grounding="street", street=QUICK, iterations=1)
+    SMALL, ugat=replace(FITTED, street=QUICK, iterations=1)
 )  # fmt: skip
 LATE_S = 2.5
 

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.interrupts import KillAt
-from tests.runs import SMALL, numbers, play_nothing, weights
+from tests.runs import FITTED, SMALL, numbers, play_nothing, weights
 from ugat_marl.data import TransitionLog, write_checkpoint
 from ugat_marl.effects import DetectionZone, load_scenario, scenario_in_domain
 from ugat_marl.envs import parallel_env
@@ -343,7 +343,7 @@ def test_a_log_whose_end_is_all_that_an_episode_reaches_is_refused_before_traini
     late = TransitionLog(provenance, whole.frame.filter(pl.col("step") >= 25))
     late.write(tmp_path / "street.parquet")
     street = replace(QUICK, parts=("channel", "effects"))
-    ugat = replace(SMALL.ugat, grounding="street", street=street)
+    ugat = replace(FITTED, street=street)
     config = replace(SMALL, ugat=ugat, real_log=tmp_path / "street.parquet", duration_s=300.0)
     with pytest.raises(LogError, match="only 50 s of an episode are left behind .* episode 0 "):
         transfer(config, tmp_path / "run", workers=1)
@@ -430,7 +430,7 @@ def test_an_interrupted_training_ends_as_an_unbroken_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     play_nothing(monkeypatch)
-    ugat = replace(SMALL.ugat, grounding="street", street=QUICK, iterations=2)
+    ugat = replace(FITTED, street=QUICK, iterations=2)
     config = replace(SMALL, real=LATE, ugat=ugat)
     transfer(config, tmp_path / "whole", workers=1)
     for task in ("fitting, iteration 1", "fitted street, iteration 2"):
@@ -512,7 +512,7 @@ def test_the_kept_policy_is_the_one_on_the_street(
 
     monkeypatch.setattr(StreetTraining, "_roll_out", seen)
     monkeypatch.setattr(StreetTraining, "_keep_better", training_was_bad)
-    ugat = replace(SMALL.ugat, grounding="street", street=QUICK, iterations=2)
+    ugat = replace(FITTED, street=QUICK, iterations=2)
     transfer(replace(SMALL, real=LATE, ugat=ugat), tmp_path / "run", workers=1)
     (_, before), (second, kept) = out_there
     assert before is None
@@ -542,9 +542,7 @@ def test_a_rule_that_is_better_in_the_fitted_street_is_kept(
     monkeypatch.setattr(Simulation, "compare", rules_are_better)
     monkeypatch.setattr(StreetTraining, "_roll_out", seen)
     street = replace(QUICK, rule_budget=2)
-    config = replace(
-        SMALL, real=LATE, ugat=replace(SMALL.ugat, grounding="street", street=street, iterations=2)
-    )
+    config = replace(SMALL, real=LATE, ugat=replace(FITTED, street=street, iterations=2))
     with pytest.raises(KeyboardInterrupt):
         transfer(config, tmp_path, reporter=KillAt("fitting, iteration 2"), workers=1)
     transfer(config, tmp_path, resume=True, workers=1)
@@ -567,7 +565,7 @@ def test_so_few_episodes_of_a_rule_are_refused() -> None:
 def test_controls_without_a_meaning_are_refused(
     control: NegativeControl, message: str, tmp_path: Path
 ) -> None:
-    ugat = replace(SMALL.ugat, grounding="street", street=QUICK)
+    ugat = replace(FITTED, street=QUICK)
     with pytest.raises(OptionError, match=message):
         transfer(replace(SMALL, negative_control=control, ugat=ugat), tmp_path, workers=1)
 
@@ -629,7 +627,7 @@ def test_histories_are_as_long_as_the_delays_that_are_looked_for() -> None:
 def test_a_broken_log_ends_a_training_before_it_begins(tmp_path: Path) -> None:
     log = in_part(recorded(LATE, 300), pl.col("step") % 2 == 0)
     log.write(tmp_path / "street.parquet")
-    ugat = replace(SMALL.ugat, grounding="street", street=QUICK)
+    ugat = replace(FITTED, street=QUICK)
     config = replace(SMALL, ugat=ugat, real_log=tmp_path / "street.parquet")
     with pytest.raises(LogError, match="decisions right before them"):
         transfer(config, tmp_path / "run", workers=1)
@@ -719,9 +717,7 @@ def test_a_learner_begins_anew_when_late_commands_are_found_no_more(
         return street
 
     monkeypatch.setattr(StreetTraining, "_fit", found_once)
-    config = replace(
-        SMALL, real=LATE, ugat=replace(SMALL.ugat, grounding="street", street=QUICK, iterations=2)
-    )
+    config = replace(SMALL, real=LATE, ugat=replace(FITTED, street=QUICK, iterations=2))
     transfer(config, tmp_path, workers=1)
     assert views[0][0] > 0
     assert views[1][0] == 0

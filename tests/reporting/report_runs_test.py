@@ -846,15 +846,16 @@ def test_a_run_leaves_all_that_its_page_wants(
     grounding: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     search_few_rules(monkeypatch, "largest-queue:20", "programme")
+    own: dict[str, Any] = {"sim_rollouts": 1, "fit": FitConfig(epochs=1)}
+    if grounding == "street":
+        own = {"street": StreetConfig(simulations=20, simulated_s=100.0, judged=1, rule_budget=0)}
     ugat = UgatConfig(
         grounding,
         pretrain_episodes=1,
         iterations=1,
         grounded_episodes=1,
-        sim_rollouts=1,
         real_rollouts=1,
-        fit=FitConfig(epochs=1),
-        street=StreetConfig(simulations=20, simulated_s=100.0, judged=1, rule_budget=0),
+        **own,
     )
     learner = "dqn" if grounding == "phase" else "universal"  # the latter takes lessons first
     config = TransferConfig("grid2x2-v1", duration_s=100, evaluation_seeds=2, tuning_seeds=1,
