@@ -177,7 +177,7 @@ def test_a_killed_process_resumes(
 ) -> None:
     folder = tmp_path / "run"
     command = [
-        "train", "single-v1", "--duration-s", "60", "--out", str(folder), "--pretrain-episodes",
+        "train", "single-v1", "--duration-s", "100", "--out", str(folder), "--pretrain-episodes",
         "11", "--iterations", "1", "--grounded-episodes", "1",
         "--real-rollouts", "2", "--no-control", "--evaluation-seeds", "1",
         "--tuning-seeds", "1", "--learner", "dqn", "--street.simulations", "20",
