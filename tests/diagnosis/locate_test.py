@@ -21,7 +21,13 @@ from ugat_marl.diagnosis.features import (
     IncomingLane,
     bins_in,
 )
-from ugat_marl.diagnosis.locate import SHOWN, _statistics, _stretches, locate
+from ugat_marl.diagnosis.locate import (
+    SHOWN,
+    _statistics,
+    _stretches,
+    locate,
+    of_no_single_day,
+)
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.statistics import Pools
 from ugat_marl.diagnosis.thresholds import Thresholds
@@ -234,6 +240,19 @@ def test_the_strongest_lane_is_among_many_wide_places() -> None:
     sizes = [abs(item.z) for item in items]
     assert sizes[:wide] == sorted(sizes[:wide], reverse=True)
     assert sizes[wide:] == sorted(sizes[wide:], reverse=True)
+
+
+@pytest.mark.parametrize(("moved", "found"), [(1, False), (3, True)])
+def test_a_difference_of_a_single_day_is_none(
+    moved: int, found: bool, reference: Reference
+) -> None:
+    shift = np.zeros((len(USED), LANES))
+    shift[1, 2] = 12.0 / moved
+    data = [*days(5, moved, shift), *days(8, 3 - moved)]
+    distance = of_no_single_day(reference, data)
+    items = locate(SITE, reference, distance, 0.05, SPAN)
+    assert any(item.lane == "in2_0" for item in items) is found
+    assert locate(SITE, reference, reference.distance(data), 0.05, SPAN), "or it is no test"
 
 
 def test_disagreements_can_be_written(reference: Reference) -> None:

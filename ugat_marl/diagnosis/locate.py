@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from ugat_marl.diagnosis.features import (
     BIN_FEATURES,
     OF_SEVERAL_LANES,
     DetectorLayout,
+    Tally,
 )
 from ugat_marl.diagnosis.records import Disagreement, Located, Tested
 from ugat_marl.diagnosis.select import Selector
@@ -44,12 +46,44 @@ def locate_gap(study: Study, base: Tested, selector: Selector) -> Located:
 
 
 def disagreements(study: Study, model: Tested) -> tuple[Disagreement, ...]:
-    """Find where the fitted periods disagree with a model."""
+    """Find where the fitted periods disagree with a model, with the noise of its test."""
     periods = study.measured.of("fit")
     spans = {(period.begin_s, period.end_s) for period in periods}
     span = spans.pop() if len(spans) == 1 else None
-    distance = model.model.reference.distance(study.fit)
-    return locate(study.layout, model.model.reference, distance, study.config.alpha, span)
+    reference = model.model.reference
+    if model.extra:
+        days, doubt = study.test_days(model.model), study.doubt(model.model.effects)
+        reference = Reference(study.pools, days, speeds=study.speeds, doubt=doubt)
+    distance = of_no_single_day(reference, study.fit, model.extra or None)
+    return locate(study.layout, reference, distance, study.config.alpha, span)
+
+
+def of_no_single_day(
+    reference: Reference, data: Sequence[Tally], extra: Mapping[str, Array] | None = None
+) -> Distance:
+    """Return the distance of data, in which no difference depends on a single day.
+
+    Statistics that are not unusual without some period are as they are without it, as in
+    `Null.test`.
+
+    Args:
+        reference: Statistics of the model.
+        data: Tallies of the periods.
+        extra: Further variance of the expected statistics, by block.
+    """
+    distance, thresholds = reference.distance(data, extra=extra), reference.pools.thresholds
+    if len(data) < 2:
+        return distance
+    without = [[*data[:i], *data[i + 1 :]] for i in range(len(data))]
+    parts = [reference.distance(part, extra=extra).z for part in without]
+    tail = thresholds.heavy_tail
+    usual = tail * math.sinh(-float(special.ndtri(thresholds.one_day / 2)) / tail)  # `two_sided`
+    z: dict[str, Array] = {}
+    for name, values in distance.z.items():
+        others = np.stack([part[name] for part in parts])
+        nearest = np.take_along_axis(others, np.abs(others).argmin(axis=0)[None], axis=0)[0]
+        z[name] = np.where(np.abs(nearest) < usual, nearest, values)
+    return replace(distance, z=z)
 
 
 def locate(

@@ -592,6 +592,17 @@ class Study:
             doubt=self.doubt(effects),
         )
 
+    def test_days(self, model: Fitted) -> tuple[Tally, ...]:
+        """Return the days with which a model is tested; those of the scenario as it is, all.
+
+        Raises:
+            OutOfTime: The budget does not suffice.
+        """
+        if not model.members:
+            return model.tallies
+        days = self.engine.ordinary(model.effects, self.engine.first(self.effort.test))
+        return tuple(day.tally for day in days.values())
+
     def doubt(self, effects: tuple[Effect, ...] = ()) -> Mapping[str, Array] | None:
         """Return variances for errors of arrivals and of detectors that stay unknown, by block.
 

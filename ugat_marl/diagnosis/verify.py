@@ -54,11 +54,7 @@ def verify_model(study: Study, base: Tested, best: Tested) -> Verified:
     """
 
     def null(model: Tested) -> Null:
-        days = model.model.tallies
-        if model.model.members:
-            numbers = study.engine.first(study.effort.test)
-            ordinary = study.engine.ordinary(model.model.effects, numbers)
-            days = tuple(day.tally for day in ordinary.values())
+        days = study.test_days(model.model)
         return study.null(days, study.heldout, effects=model.model.effects)
 
     before = null(base).test(study.heldout)
