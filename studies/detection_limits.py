@@ -31,6 +31,9 @@ from ugat_marl.progress import Bars, Reporter, Silent
 from ugat_marl.scenarios import Scenario
 from ugat_marl.seeding import derive_seed
 
+_MOST_DRAWS = 20
+"""Data sets in a row that may contradict the scenario as it is; by chance one in twenty does."""
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -62,9 +65,6 @@ def domains_at(limits: Sequence[DetectionLimit]) -> list[tuple[str, str]]:
             if value is not None and value != limit.usual
         ]
     return domains
-
-
-_MOST_DRAWS = 20
 
 
 @dataclass(frozen=True)

@@ -210,7 +210,9 @@ def test_a_model_that_is_merely_noisier_is_no_gain() -> None:
         best = tested(Reference(pools, days(40, spread, mean), prior=base))
         found: list[float] = []
         for _ in range(40):
-            held: Any = SimpleNamespace(heldout=days(2, 1.0, mean), null=lambda *_, **__: null)
+            held: Any = SimpleNamespace(
+                heldout=days(2, 1.0, mean), null=lambda *_, **__: null, test_days=lambda _: ()
+            )
             found.append(verify_model(held, tested(base), best).gain)
         return found
 

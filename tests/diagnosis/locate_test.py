@@ -25,8 +25,10 @@ from ugat_marl.diagnosis.locate import (
     SHOWN,
     _statistics,
     _stretches,
+    difference_of,
     locate,
     of_no_single_day,
+    two_sided,
 )
 from ugat_marl.diagnosis.records import Disagreement
 from ugat_marl.diagnosis.statistics import Pools
@@ -240,6 +242,10 @@ def test_the_strongest_lane_is_among_many_wide_places() -> None:
     sizes = [abs(item.z) for item in items]
     assert sizes[:wide] == sorted(sizes[:wide], reverse=True)
     assert sizes[wide:] == sorted(sizes[wide:], reverse=True)
+
+
+def test_a_p_value_and_its_difference() -> None:
+    assert two_sided(difference_of(0.25, 6.0), 6.0) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize(("moved", "found"), [(1, False), (3, True)])

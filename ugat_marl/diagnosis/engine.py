@@ -427,6 +427,10 @@ class Engine:
         numbers = (n for n in itertools.count() if n not in self.ordinary_days.set_aside)
         return list(itertools.islice(numbers, count))
 
+    def test_days(self, effects: Sequence[Effect], count: int) -> tuple[Tally, ...]:
+        """Return the first ordinary days of a model, at most `count` of them."""
+        return tuple(day.tally for day in self.ordinary(effects, self.first(count)).values())
+
     def ordinary(
         self,
         effects: Sequence[Effect],

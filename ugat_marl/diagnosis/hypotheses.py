@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from statistics import fmean
-from typing import Any
+from typing import Any, TypeVar
 
 from ugat_marl.effects import (
     EVERYWHERE,
@@ -99,6 +99,7 @@ class Hypothesis:
         return self.nothing is not None and values == self.clipped(self.nothing)
 
 
+_T = TypeVar("_T")
 Members = tuple[tuple[Hypothesis, tuple[float, ...]], ...]
 """A set of effects: hypotheses and the values of their free fields."""
 
@@ -312,8 +313,8 @@ def keys_of(members: Members) -> set[tuple[Any, ...]]:
     return {hypothesis.key for hypothesis, _ in members}
 
 
-def each_left_out(members: Members) -> list[Members]:
-    """Return the sets that lack one effect each."""
+def each_left_out(members: Sequence[_T]) -> list[tuple[_T, ...]]:
+    """Return the sets that lack one member each."""
     return [(*members[:index], *members[index + 1 :]) for index in range(len(members))]
 
 

@@ -18,6 +18,7 @@ from ugat_marl.diagnosis.features import (
     DetectorLayout,
     Tally,
 )
+from ugat_marl.diagnosis.hypotheses import each_left_out
 from ugat_marl.diagnosis.records import Disagreement, Located, Tested
 from ugat_marl.diagnosis.select import Selector
 from ugat_marl.diagnosis.statistics import Array, Distance, Reference
@@ -74,10 +75,8 @@ def of_no_single_day(
     distance, thresholds = reference.distance(data, extra=extra), reference.pools.thresholds
     if len(data) < 2:
         return distance
-    without = [[*data[:i], *data[i + 1 :]] for i in range(len(data))]
-    parts = [reference.distance(part, extra=extra).z for part in without]
-    tail = thresholds.heavy_tail
-    usual = tail * math.sinh(-float(special.ndtri(thresholds.one_day / 2)) / tail)  # `two_sided`
+    parts = [reference.distance(part, extra=extra).z for part in each_left_out(data)]
+    usual = difference_of(thresholds.one_day, thresholds.heavy_tail)
     z: dict[str, Array] = {}
     for name, values in distance.z.items():
         others = np.stack([part[name] for part in parts])
@@ -149,6 +148,11 @@ def two_sided(z: float, tail: float) -> float:
     """
     soft = tail * math.asinh(abs(z) / tail)
     return max(2.0 * float(special.ndtr(-soft)), 1e-300)
+
+
+def difference_of(p: float, tail: float) -> float:
+    """Return the standardised difference, above 0, of which `two_sided` has this p value."""
+    return tail * math.sinh(-float(special.ndtri(p / 2.0)) / tail)
 
 
 def _statistics(

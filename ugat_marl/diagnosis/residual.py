@@ -17,6 +17,7 @@ from scipy import special
 
 from ugat_marl.diagnosis.features import Tally
 from ugat_marl.diagnosis.fit import WIDE
+from ugat_marl.diagnosis.hypotheses import each_left_out
 from ugat_marl.diagnosis.propose import Direction
 from ugat_marl.diagnosis.records import ResidualTest
 from ugat_marl.diagnosis.statistics import (
@@ -108,8 +109,8 @@ class Null:
         residual = self._judge(self.reference.distance(data, extra=extra))
         if len(data) < 2 or residual.p > self._thresholds.one_day:
             return residual
-        others = [[*data[:i], *data[i + 1 :]] for i in range(len(data))]
-        without = [self._judge(self.reference.distance(part, extra=extra)).p for part in others]
+        distances = (self.reference.distance(x, extra=extra) for x in each_left_out(data))
+        without = [self._judge(distance).p for distance in distances]
         return (
             replace(residual, p=max(without))
             if max(without) > self._thresholds.one_day

@@ -229,10 +229,8 @@ class Selector:
             errors, _ = uncertainty(fitter, model, self._days(model), steps=True)
         return replace(tested, errors=errors)
 
-    def _days(self, model: Fitted) -> list[Tally]:
-        engine = self._fitter.engine
-        days = engine.ordinary(model.effects, engine.first(self._effort.test))
-        return [day.tally for day in days.values()]
+    def _days(self, model: Fitted) -> tuple[Tally, ...]:
+        return self._fitter.engine.test_days(model.effects, self._effort.test)
 
     def _untested(self, model: Fitted, base: Tested) -> Tested:
         """Return a model for whose own test there was no time; its errors are not known.

@@ -600,8 +600,7 @@ class Study:
         """
         if not model.members:
             return model.tallies
-        days = self.engine.ordinary(model.effects, self.engine.first(self.effort.test))
-        return tuple(day.tally for day in days.values())
+        return self.engine.test_days(model.effects, self.effort.test)
 
     def doubt(self, effects: tuple[Effect, ...] = ()) -> Mapping[str, Array] | None:
         """Return variances for errors of arrivals and of detectors that stay unknown, by block.
