@@ -380,7 +380,10 @@ def test_a_stopped_command_leaves_its_log_and_nothing_else(
         (["--policy", "programme", "--start"], "programme"),
         (["--policy", "longest-waiting", "--start"], "waiting times"),
         (["--policy", "random", "--start", "--limits.answer-ms", "5"], "reserve_ms"),
-        (["--policy", "random", "--start", "--limits.green-s", "0"], "green_s = 0: must be above"),
+        (
+            ["--policy", "random", "--start", "--limits.green-s", "0"],
+            "--limits.green-s 0: must be above",
+        ),
         (["--policy", "a.pt", "--start", "--health", "a.pt"], "--health and --policy are one file"),
         (["--policy", "random", "--start", "--log", "a", "--health", "./a"], "are one file"),
         (["--policy", "random", "--start", "--health", __file__], "something else than the state"),

@@ -515,7 +515,7 @@ def test_commands_refuse_what_is_not_there_and_leave_nothing(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main([*command, "--device", "cuda"]) == 2
-    assert "device = 'cuda': torch" in capsys.readouterr().err
+    assert "--device cuda: torch" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
     assert main([*command, "--device", "gpu"]) == 2
     assert "must be cpu, cuda, or cuda:N" in capsys.readouterr().err
